@@ -1,0 +1,1 @@
+"""The MINT network as transformers classes: configuration, model, processors, conversion."""

@@ -1,0 +1,145 @@
+"""The sizes of a MINT network, validated by name when they are made."""
+
+from typing import Any, Self
+
+from huggingface_hub.dataclasses import strict
+from transformers.configuration_utils import PreTrainedConfig
+
+
+@strict
+class MintConfig(PreTrainedConfig):
+    """Configuration of `MintModel`; the defaults are the public release's (1.14 billion parameters).
+
+    Args:
+        image_size: (height, width) of a frame as the network sees it, pixels; multiples of patch_size.
+        patch_size: side of a square patch, pixels.
+        position_grid: side, in patches, of the square grid the position embedding was trained on.
+        hidden_size: width C of the patch encoder and of the aggregator.
+        num_attention_heads: heads in the encoder, frame and global layers.
+        encoder_layers: depth of the patch encoder.
+        aggregator_layers: pairs of one frame layer and one global layer.
+        num_register_tokens: register tokens, in the encoder and again in the aggregator.
+        camera_layers: depth of the camera head's trunk, run once an iteration.
+        camera_heads: attention heads of the camera head, which is 2 C wide.
+        camera_iterations: refinement iterations of the camera head.
+        fov_hidden_size: width of the field-of-view head.
+        fov_heads: attention heads of the field-of-view head.
+        fov_layers: depth of the field-of-view head.
+        hand_hidden_size: width of the hand head.
+        hand_heads: attention heads of the hand head.
+        hand_layers: self-attention layers over the eight hand queries.
+        hand_iterations: iterations of the hand head; the first is absolute, later ones are increments.
+        presence_hidden_size: width of the presence head.
+        presence_heads: attention heads of the presence head.
+        window: frames the network was trained to see at once.
+        encoder_layer_scale: initial LayerScale of the patch encoder.
+        aggregator_layer_scale: initial LayerScale of the aggregator and of the camera head.
+        initializer_range: standard deviation of freshly initialised linear weights.
+
+    Raises:
+        ValueError: (when made) a size that does not divide what it must, naming the field.
+    """
+
+    model_type = "mint"
+    attribute_map = {"num_hidden_layers": "aggregator_layers"}  # noqa: RUF012 (transformers' own protocol)
+
+    image_size: list[int] | tuple[int, int] = (378, 518)
+    patch_size: int = 14
+    position_grid: int = 37
+    hidden_size: int = 1024
+    num_attention_heads: int = 16
+    encoder_layers: int = 24
+    aggregator_layers: int = 24
+    num_register_tokens: int = 4
+    camera_layers: int = 4
+    camera_heads: int = 16
+    camera_iterations: int = 4
+    fov_hidden_size: int = 512
+    fov_heads: int = 8
+    fov_layers: int = 2
+    hand_hidden_size: int = 512
+    hand_heads: int = 8
+    hand_layers: int = 1
+    hand_iterations: int = 2
+    presence_hidden_size: int = 256
+    presence_heads: int = 4
+    window: int = 32
+    encoder_layer_scale: float = 1.0
+    aggregator_layer_scale: float = 0.01
+    initializer_range: float = 0.02
+
+    def __post_init__(self, **kwargs: Any) -> None:
+        self.image_size = list(self.image_size)
+        super().__post_init__(**kwargs)
+
+    def validate_architecture(self) -> None:
+        """Check that sizes fit each other (called by transformers when a configuration is made)."""
+        if len(self.image_size) != 2:
+            raise ValueError(f"image_size: expected (height, width), got {self.image_size}")
+        for name in ("height", "width"):
+            side = self.image_size[name == "width"]
+            if side <= 0 or side % self.patch_size:
+                raise ValueError(
+                    f"image_size: expected a {name} that is a positive multiple of "
+                    f"patch_size={self.patch_size}, got {side}"
+                )
+        for width, heads, factor in (
+            ("hidden_size", "num_attention_heads", 4),
+            ("fov_hidden_size", "fov_heads", 1),
+            ("hand_hidden_size", "hand_heads", 1),
+            ("presence_hidden_size", "presence_heads", 1),
+        ):
+            unit = getattr(self, heads) * factor
+            if unit <= 0 or getattr(self, width) % unit:
+                extra = " (x4: rotary positions split a head in four)" if factor == 4 else ""
+                raise ValueError(
+                    f"{width}: expected a multiple of {heads}={getattr(self, heads)}{extra}, "
+                    f"got {getattr(self, width)}"
+                )
+        if self.camera_heads <= 0 or 2 * self.hidden_size % self.camera_heads:
+            raise ValueError(
+                f"camera_heads: expected a divisor of 2 * hidden_size={2 * self.hidden_size}, "
+                f"got {self.camera_heads}"
+            )
+        for name in ("camera_iterations", "hand_iterations", "aggregator_layers", "window"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
+
+    @property
+    def grid_hw(self) -> tuple[int, int]:
+        """Patches of a frame, (rows, columns)."""
+        height, width = self.image_size
+        return height // self.patch_size, width // self.patch_size
+
+    @property
+    def num_special_tokens(self) -> int:
+        """Tokens before a frame's patches: one camera, the registers, one scale."""
+        return self.num_register_tokens + 2
+
+    @classmethod
+    def full(cls, **overrides: Any) -> Self:
+        """Sizes of the public release: 1.14 billion parameters, 378 x 518 pixels."""
+        return cls(**overrides)
+
+    @classmethod
+    def tiny(cls, **overrides: Any) -> Self:
+        """Sizes that run in real time on two CPU cores (for the default checkpoint)."""
+        sizes: dict[str, Any] = {
+            "image_size": (126, 168),
+            "position_grid": 12,
+            "hidden_size": 192,
+            "num_attention_heads": 3,
+            "encoder_layers": 6,
+            "aggregator_layers": 4,
+            "camera_layers": 2,
+            "camera_heads": 6,
+            "fov_hidden_size": 128,
+            "fov_heads": 4,
+            "hand_hidden_size": 192,
+            "hand_heads": 6,
+            "presence_hidden_size": 96,
+        }
+        return cls(**(sizes | overrides))
+
+
+__all__ = ["MintConfig"]

@@ -1,0 +1,290 @@
+"""Checkpoints made elsewhere, under our names: the public release, and LingBot-Map as a start.
+
+`RENAMES` is the one table from the release's tensor names to ours, applied from top to bottom. It is
+registered with transformers, so that `MintModel.from_pretrained` reads a folder under either naming.
+"""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from huggingface_hub import get_safetensors_metadata
+from safetensors import safe_open
+from torch import Tensor
+from transformers.conversion_mapping import register_checkpoint_conversion_mapping
+from transformers.core_model_loading import WeightRenaming
+from transformers.utils import cached_file, logging
+
+from .configuration_mint import MintConfig
+
+logger = logging.get_logger(__name__)
+
+RENAMES: tuple[tuple[str, str], ...] = (
+    # The trunk.
+    (r"^backbone\.aggregator\.patch_embed\.", "encoder."),
+    (r"^encoder\.patch_embed\.proj\.", "encoder.patch_embedding."),
+    (r"^encoder\.pos_embed", "encoder.position_embeddings"),
+    (r"^backbone\.aggregator\.", "aggregator."),
+    (r"^backbone\.camera_head\.", "camera_head."),
+    (r"^backbone\.fov_head\.", "fov_head."),
+    (r"^hand_presence_head\.", "presence_head."),
+    # Layers.
+    (r"^aggregator\.frame_blocks\.", "aggregator.frame_layers."),
+    (r"^aggregator\.global_blocks\.", "aggregator.global_layers."),
+    (r"^encoder\.blocks\.", "encoder.layers."),
+    (r"_head\.trunk\.", "_head.layers."),
+    (r"\.attn\.qkv\.", ".attention.qkv."),
+    (r"\.attn\.q_norm\.", ".attention.q_norm."),
+    (r"\.attn\.k_norm\.", ".attention.k_norm."),
+    (r"\.attn\.proj\.", ".attention.out."),
+    (r"\.ls1\.gamma", ".layer_scale1"),
+    (r"\.ls2\.gamma", ".layer_scale2"),
+    # Heads.
+    (r"^camera_head\.empty_pose_tokens", "camera_head.empty_pose"),
+    (r"^camera_head\.trunk_norm\.", "camera_head.layers_norm."),
+    (r"^camera_head\.poseLN_modulation\.1\.", "camera_head.modulation."),
+    (r"^camera_head\.pose_branch\.", "camera_head.pose_mlp."),
+    (r"^hand_head\.empty_pred", "hand_head.empty_state"),
+    (r"^hand_head\.embed_pred\.", "hand_head.embed_state."),
+    (r"^hand_head\.adaln_mod\.1\.", "hand_head.modulation."),
+    (r"^hand_head\.query(?!s)", "hand_head.queries"),
+    (r"^presence_head\.query(?!s)", "presence_head.queries"),
+    (r"\.cross_attn\.in_proj_weight", ".cross_attention.qkv.weight"),
+    (r"\.cross_attn\.in_proj_bias", ".cross_attention.qkv.bias"),
+    (r"\.cross_attn\.out_proj\.", ".cross_attention.out."),
+    *(
+        (rf"^hand_head\.{theirs}\.{i}\.", f"hand_head.{ours}.{part}.")
+        for theirs, ours in (
+            ("comp_heads", "absolute_heads"),
+            ("refine_comp_heads", "increment_heads"),
+        )
+        for i, part in enumerate(("translation", "orientation", "pose", "shape"))
+    ),
+)
+"""(pattern of the release's names, replacement), every one applied in order to every key.
+
+Each step can be undone, so that transformers can also write the release's names
+(`save_pretrained(..., save_original_format=True)`)."""
+
+RELEASE_MARKER = "backbone.aggregator.camera_token"
+"""A tensor name that every checkpoint under the release's naming has, and none of ours."""
+
+
+def rename_key(key: str) -> str:
+    """Our name of a tensor of the release; our own names come back unchanged."""
+    for pattern, replacement in RENAMES:
+        key = re.sub(pattern, replacement, key)
+    return key
+
+
+def register_conversion(class_name: str = "MintModel") -> None:
+    """Let `from_pretrained` of the named class read the release's tensor names."""
+    register_checkpoint_conversion_mapping(
+        class_name,
+        [WeightRenaming(pattern, replacement) for pattern, replacement in RENAMES],
+        overwrite=True,
+    )
+
+
+def read_layout(source: str | Path, **hub: Any) -> dict[str, tuple[int, ...]]:
+    """Tensor names and shapes of `model.safetensors` in a folder or hub repository, headers only.
+
+    Args:
+        source: a folder, or a repository id.
+        hub: `revision` and `token`, for a repository.
+
+    Raises:
+        FileNotFoundError: a folder without safetensors weights, naming the folder.
+    """
+    folder = Path(source)
+    if not folder.is_dir():
+        metadata = get_safetensors_metadata(str(source), **hub)
+        return {
+            key: tuple(info.shape)
+            for file in metadata.files_metadata.values()
+            for key, info in file.tensors.items()
+        }
+    files = sorted(folder.glob("*.safetensors"))
+    if not files:
+        raise FileNotFoundError(f"{folder}: expected model.safetensors, found no *.safetensors file")
+    layout: dict[str, tuple[int, ...]] = {}
+    for file in files:
+        with safe_open(file, "pt") as handle:
+            layout |= {k: tuple(handle.get_slice(k).get_shape()) for k in handle.keys()}
+    return layout
+
+
+def config_from_layout(layout: Mapping[str, tuple[int, ...]], source: object) -> MintConfig:
+    """The configuration of a checkpoint that came without one: `full()`, if its shapes are those.
+
+    Head counts cannot be read off shapes, so nothing but the released layout is ever guessed.
+
+    Raises:
+        ValueError: another layout, asking for `config=`.
+    """
+    from .modeling_mint import MintModel  # the model registers this module's table
+
+    config = MintConfig.full()
+    with torch.device("meta"):
+        expected = {k: tuple(v.shape) for k, v in MintModel(config).state_dict().items()}
+    got = {rename_key(key): tuple(shape) for key, shape in layout.items()}
+    if got == expected:
+        return config
+    differing = sorted(expected.keys() ^ got.keys()) or sorted(
+        key for key in expected if expected[key] != got[key]
+    )
+    first = differing[0]
+    raise ValueError(
+        f"{source}: has weights but no config.json of ours, and they are not the public release's "
+        f"({len(differing)} tensors differ, first {first}: expected {expected.get(first, 'absent')}, "
+        f"got {got.get(first, 'absent')}). Head counts cannot be read off shapes: "
+        "pass config=MintConfig(...)"
+    )
+
+
+def lingbot_state_dict(path: str | Path) -> dict[str, Tensor]:
+    """Weights of a LingBot-Map checkpoint under our names, without its camera head.
+
+    Args:
+        path: `lingbot-map.pt`, a torch pickle; read with weights_only=True, so no code in it runs.
+
+    Returns:
+        Tensors of the encoder and the aggregator (and whatever else it holds, renamed alike).
+
+    Raises:
+        ValueError: not such a checkpoint.
+    """
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except FileNotFoundError:
+        raise
+    except Exception as error:
+        raise ValueError(f"{path}: expected a LingBot-Map torch checkpoint: {error}") from error
+    for wrapper in ("model", "state_dict"):
+        if isinstance(state, dict) and isinstance(state.get(wrapper), dict):
+            state = state[wrapper]
+    if not isinstance(state, dict) or "aggregator.camera_token" not in state:
+        raise ValueError(
+            f"{path}: expected a LingBot-Map state dict with 'aggregator.camera_token'; "
+            f"got {sorted(state)[:5] if isinstance(state, dict) else type(state).__name__}"
+        )
+    return {
+        rename_key(f"backbone.{key}"): tensor
+        for key, tensor in state.items()
+        if not key.startswith("camera_head") and isinstance(tensor, Tensor)
+    }
+
+
+def load_lingbot(model: torch.nn.Module, path: str | Path) -> dict[str, list[str]]:
+    """Start a model from a LingBot-Map checkpoint: encoder and aggregator loaded, heads untouched.
+
+    Args:
+        model: a `MintModel`; its encoder and aggregator must fit the checkpoint.
+        path: `lingbot-map.pt`.
+
+    Returns:
+        {"loaded": names now from the checkpoint, "kept": names that keep their initial values,
+        "unused": names in the checkpoint that the model has no place for}, each sorted.
+
+    Raises:
+        ValueError: a tensor of the encoder or aggregator is missing or has another shape.
+    """
+    weights = lingbot_state_dict(path)
+    own = model.state_dict()
+    needed = [k for k in own if k.startswith(("encoder.", "aggregator."))]
+    missing = [k for k in needed if k not in weights]
+    wrong = [k for k in needed if k in weights and weights[k].shape != own[k].shape]
+    if missing or wrong:
+        first = (missing + wrong)[0]
+        got = tuple(weights[first].shape) if first in weights else "absent"
+        raise ValueError(
+            f"{path}: {len(missing)} tensors missing and {len(wrong)} of another shape for this "
+            f"configuration, first {first}: expected {tuple(own[first].shape)}, got {got}"
+        )
+    with torch.no_grad():
+        for key in needed:
+            own[key].copy_(weights[key])
+    return {
+        "loaded": sorted(needed),
+        "kept": sorted(set(own) - set(needed)),
+        "unused": sorted(set(weights) - set(needed)),
+    }
+
+
+def load_checked(
+    cls: Any, load: Callable[..., Any], source: str | Path | None, *args: Any, **kwargs: Any
+) -> Any:
+    """Call transformers' own `from_pretrained`, then refuse what does not fit.
+
+    Args:
+        cls: the model class, for messages.
+        load: the bound `PreTrainedModel.from_pretrained`.
+        source: folder, repository, or None when `state_dict` is given (then nothing is checked: the
+            caller chose the tensors).
+        args: passed on.
+        kwargs: passed on; `strict` (default True) is ours.
+
+    Raises:
+        ValueError: see `MintPreTrainedModel.from_pretrained`.
+    """
+    strict = kwargs.pop("strict", True)
+    want_info = kwargs.pop("output_loading_info", False)
+    if source is None:
+        return load(source, *args, output_loading_info=want_info, **kwargs)
+    if kwargs.get("config") is None and not _has_config(source, kwargs):
+        hub = {k: kwargs[k] for k in ("revision", "token") if kwargs.get(k) is not None}
+        kwargs["config"] = config_from_layout(read_layout(source, **hub), source)
+    forgive = kwargs.pop("ignore_mismatched_sizes", not strict)
+    # Sizes are forgiven while loading so that all faults are listed together, then refused here.
+    model, info = load(
+        source, *args, output_loading_info=True, ignore_mismatched_sizes=True, **kwargs
+    )
+    faults = _describe_faults(info, count_mismatched=not forgive)
+    if faults and strict:
+        raise ValueError(f"{source}: these weights do not fit {cls.__name__}: {faults}")
+    if faults:
+        logger.warning("%s: loaded what fits %s; %s", source, cls.__name__, faults)
+    broken = [
+        name
+        for name, tensor in model.state_dict().items()
+        if not tensor.is_meta and tensor.is_floating_point() and not torch.isfinite(tensor.sum())
+        and not torch.isfinite(tensor).all()
+    ]
+    if broken:
+        raise ValueError(
+            f"{source}: NaN or infinity in {len(broken)} tensors: {_some(broken)}. "
+            "The file is damaged or its training diverged"
+        )
+    return (model, info) if want_info else model
+
+
+def _has_config(source: str | Path, kwargs: Mapping[str, Any]) -> bool:
+    keys = ("revision", "token", "cache_dir", "local_files_only", "subfolder", "force_download")
+    options = {k: kwargs[k] for k in keys if kwargs.get(k) is not None}
+    found = cached_file(
+        str(source),
+        "config.json",
+        _raise_exceptions_for_missing_entries=False,
+        **options,
+    )
+    return found is not None
+
+
+def _describe_faults(info: Mapping[str, Any], count_mismatched: bool) -> str:
+    parts = []
+    for kind in ("missing", "unexpected"):
+        if names := sorted(info[f"{kind}_keys"]):
+            parts.append(f"{len(names)} {kind}: {_some(names)}")
+    mismatched = sorted(info["mismatched_keys"]) if count_mismatched else []
+    if mismatched:
+        shapes = [f"{name} (expected {tuple(own)}, got {tuple(got)})" for name, got, own in mismatched]
+        parts.append(f"{len(mismatched)} of another shape: {_some(shapes)}")
+    return "; ".join(parts)
+
+
+def _some(names: Sequence[str], most: int = 8) -> str:
+    """The first names of a list, and how many more."""
+    rest = len(names) - most
+    return ", ".join(names[:most]) + (f", and {rest} more" if rest > 0 else "")

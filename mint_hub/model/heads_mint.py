@@ -1,0 +1,184 @@
+"""The four heads that read the aggregator's tokens: camera, field of view, hands, presence.
+
+Shape letters: B batch, T frames, P tokens a frame, W = 2C width of the tokens, H head's own width.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from ..geometry import hand_state
+from ..geometry.hand_state import HAND_STATE_SIZE, HandState
+from ..geometry.rotations import rotvec_to_matrix
+from .configuration_mint import MintConfig
+from .layers_mint import MintCrossAttention, MintLayer, MintMLP
+
+POSE_SIZE = 7
+MAX_ROTATION_STEP = math.radians(30.0)
+INITIAL_FOV_VH_DEG = (60.0, 75.0)
+HAND_PARTS = {"translation": (3, 3), "orientation": (6, 3), "pose": (90, 45), "shape": (10, 10)}
+"""Parts of a hand's state, in order: numbers when absolute, numbers of an increment."""
+
+
+def modulate(x: Tensor, modulation: Tensor) -> Tensor:
+    """x + gate * (norm(x) * (1 + scale) + shift), the norm without affine part, eps 1e-6."""
+    shift, scale, gate = modulation.chunk(3, -1)
+    normed = nn.functional.layer_norm(x, x.shape[-1:], eps=1e-6)
+    return gate * (normed * (1 + scale) + shift) + x
+
+
+def bounded_rotation(rotvec: Tensor) -> Tensor:
+    """Rotation vectors (..., 3) -> matrices (..., 3, 3), angles bounded smoothly to 30 degrees."""
+    angle = rotvec.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
+    bound = MAX_ROTATION_STEP * torch.tanh(angle / MAX_ROTATION_STEP) / angle
+    return rotvec_to_matrix(rotvec * bound)
+
+
+class MintCameraHead(nn.Module):
+    """World-to-camera pose of each frame, refined over several iterations, causal in time, fp32."""
+
+    def __init__(self, config: MintConfig):
+        super().__init__()
+        width = 2 * config.hidden_size
+        self.iterations = config.camera_iterations
+        self.token_norm = nn.LayerNorm(width)
+        self.empty_pose = nn.Parameter(torch.zeros(1, 1, POSE_SIZE))
+        self.embed_pose = nn.Linear(POSE_SIZE, width)
+        self.modulation = nn.Linear(width, 3 * width)
+        self.layers = nn.ModuleList(
+            MintLayer(
+                width,
+                config.camera_heads,
+                layer_scale=config.aggregator_layer_scale,
+                causal=True,
+            )
+            for _ in range(config.camera_layers)
+        )
+        self.layers_norm = nn.LayerNorm(width)
+        self.pose_mlp = MintMLP(width, width // 2, POSE_SIZE)
+
+    def forward(self, camera_tokens: Tensor, implementation: str) -> tuple[Tensor, ...]:
+        """(B, T, W) -> per iteration (B, T, 7): translation 3 (metres), quaternion xyzw 4 (raw)."""
+        with torch.autocast(camera_tokens.device.type, enabled=False):
+            tokens = self.token_norm(camera_tokens.to(self.token_norm.weight.dtype))
+            poses: list[Tensor] = []
+            for _ in range(self.iterations):
+                seen = poses[-1].detach() if poses else self.empty_pose.expand(*tokens.shape[:2], -1)
+                condition = nn.functional.silu(self.embed_pose(seen))
+                x = modulate(tokens, self.modulation(condition))
+                for layer in self.layers:
+                    x = layer(x, implementation)
+                step = self.pose_mlp(self.layers_norm(x))
+                poses.append(poses[-1] + step if poses else step)
+            return tuple(poses)
+
+
+class MintFovHead(nn.Module):
+    """Vertical and horizontal field of view of each frame, bidirectional in time."""
+
+    def __init__(self, config: MintConfig):
+        super().__init__()
+        width = config.fov_hidden_size
+        self.input_norm = nn.LayerNorm(2 * config.hidden_size)
+        self.input_proj = nn.Linear(2 * config.hidden_size, width)
+        self.layers = nn.ModuleList(
+            MintLayer(width, config.fov_heads) for _ in range(config.fov_layers)
+        )
+        self.output_norm = nn.LayerNorm(width)
+        self.output = nn.Linear(width, 2)
+
+    def forward(self, camera_tokens: Tensor, implementation: str) -> Tensor:
+        """(B, T, W) -> (B, T, 2) radians (vertical, horizontal), float32."""
+        x = self.input_proj(self.input_norm(camera_tokens))
+        for layer in self.layers:
+            x = layer(x, implementation)
+        return nn.functional.softplus(self.output(self.output_norm(x)).float()) + 1e-4
+
+
+class MintHandHead(nn.Module):
+    """The 109 numbers of both hands of each frame: absolute first, then refined by increments."""
+
+    def __init__(self, config: MintConfig):
+        super().__init__()
+        width = config.hand_hidden_size
+        self.iterations = config.hand_iterations
+        self.queries = nn.Parameter(torch.zeros(1, 2 * len(HAND_PARTS), width))
+        self.empty_state = nn.Parameter(torch.zeros(1, 1, HAND_STATE_SIZE))
+        self.token_proj = nn.Linear(2 * config.hidden_size, width)
+        self.token_norm = nn.LayerNorm(width)
+        self.embed_state = nn.Linear(HAND_STATE_SIZE, width)
+        self.modulation = nn.Linear(width, 3 * width)
+        self.cross_attention = MintCrossAttention(width, config.hand_heads)
+        self.layers = nn.ModuleList(
+            MintLayer(width, config.hand_heads) for _ in range(config.hand_layers)
+        )
+        self.out_norm = nn.LayerNorm(width)
+        self.absolute_heads = nn.ModuleDict(
+            {name: nn.Linear(width, size) for name, (size, _) in HAND_PARTS.items()}
+        )
+        self.increment_heads = nn.ModuleDict(
+            {name: nn.Linear(width, size) for name, (_, size) in HAND_PARTS.items()}
+        )
+
+    def forward(self, tokens: Tensor, implementation: str) -> tuple[Tensor, ...]:
+        """(B, T, P, W) -> per iteration (B, T, 2, 109), camera frame, metres, left hand first."""
+        batch, frames = tokens.shape[:2]
+        context = self.token_norm(self.token_proj(tokens.flatten(0, 1)))  # (BT, P, H)
+        keys_values = self.cross_attention.project_context(context)
+        queries = self.queries.expand(context.shape[0], -1, -1)  # (BT, 8, H)
+        states: list[Tensor] = []
+        for _ in range(self.iterations):
+            seen = states[-1].detach() if states else self.empty_state.expand(len(queries), 2, -1)
+            condition = nn.functional.silu(self.embed_state(seen.to(queries.dtype)))
+            modulation = self.modulation(condition).repeat_interleave(len(HAND_PARTS), 1)
+            x = modulate(queries, modulation)
+            x = x + self.cross_attention(x, keys_values, implementation)
+            for layer in self.layers:
+                x = layer(x, implementation)
+            x = self.out_norm(x).unflatten(1, (2, len(HAND_PARTS)))  # (BT, 8, H) -> (BT, 2, 4, H)
+            states.append(
+                self.refine(states[-1], x) if states else self.read(self.absolute_heads, x)
+            )
+        return tuple(state.unflatten(0, (batch, frames)) for state in states)
+
+    @staticmethod
+    def read(heads: nn.ModuleDict, x: Tensor) -> Tensor:
+        """Features (..., 4, H) of the four parts -> their numbers, joined, float32."""
+        parts = [heads[name](x[..., i, :]).float() for i, name in enumerate(HAND_PARTS)]
+        return torch.cat(parts, -1)
+
+    def refine(self, state: Tensor, x: Tensor) -> Tensor:
+        """Add translation and shape increments; compose rotations on the right, R exp([w])."""
+        step = self.read(self.increment_heads, x)
+        translation, orientation, pose, shape = step.split([n for _, n in HAND_PARTS.values()], -1)
+        before = hand_state.unpack(state)
+        return HandState.from_matrices(
+            before.translation + translation,
+            before.orientation(check=False) @ bounded_rotation(orientation),
+            before.joint_rotations(check=False) @ bounded_rotation(pose.unflatten(-1, (15, 3))),
+            before.shape_params + shape,
+        ).pack()
+
+
+class MintPresenceHead(nn.Module):
+    """Whether each hand is in the picture: one logit a side, from patch tokens alone."""
+
+    def __init__(self, config: MintConfig):
+        super().__init__()
+        width = config.presence_hidden_size
+        self.queries = nn.Parameter(torch.zeros(1, 2, width))
+        self.token_proj = nn.Linear(2 * config.hidden_size, width)
+        self.token_norm = nn.LayerNorm(width)
+        self.cross_attention = MintCrossAttention(width, config.presence_heads)
+        self.out_norm = nn.LayerNorm(width)
+        self.classifier = nn.Linear(width, 1)
+
+    def forward(self, patch_tokens: Tensor, implementation: str) -> Tensor:
+        """(B, T, N, W) -> (B, T, 2) logits, left hand first, float32."""
+        batch, frames = patch_tokens.shape[:2]
+        context = self.token_norm(self.token_proj(patch_tokens.flatten(0, 1)))
+        queries = self.queries.expand(context.shape[0], -1, -1)
+        keys_values = self.cross_attention.project_context(context)
+        x = self.out_norm(queries + self.cross_attention(queries, keys_values, implementation))
+        return self.classifier(x).squeeze(-1).float().unflatten(0, (batch, frames))

@@ -1,0 +1,380 @@
+"""MINT: a window of egocentric frames in, world-space camera and two-hand motion out.
+
+Shape letters: B batch, T frames in a window, H x W image, C width, N patches of a frame,
+S = 2 + registers special tokens, P = S + N tokens a frame.
+
+Two things run over the frames: a patch encoder that sees one frame at a time (so a frame that two
+windows share is encoded once, `MintModel.encode_frames`), and an aggregator that alternates between
+attention within a frame and attention over the whole window. Four heads read its last pair.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from torch import Tensor, nn
+from transformers import initialization as init
+from transformers.modeling_utils import PreTrainedModel
+from transformers.utils import ModelOutput
+from transformers.utils.generic import can_return_tuple, merge_with_config_defaults
+from transformers.utils.output_capturing import OutputRecorder, capture_outputs
+
+from .configuration_mint import MintConfig
+from .conversion_mint import load_checked, load_lingbot, register_conversion
+from .heads_mint import (
+    INITIAL_FOV_VH_DEG,
+    MintCameraHead,
+    MintFovHead,
+    MintHandHead,
+    MintPresenceHead,
+)
+from .layers_mint import (
+    MintAttention,
+    MintEncoderLayer,
+    MintFrameLayer,
+    MintGlobalLayer,
+    MintLayer,
+    rotary_positions,
+)
+
+IMAGE_MEAN = (0.485, 0.456, 0.406)
+IMAGE_STD = (0.229, 0.224, 0.225)
+
+
+@dataclass
+class MintOutput(ModelOutput):
+    """What `MintModel` returns for windows of T frames; hands are left first, metres, radians.
+
+    Attributes:
+        loss: scalar, when labels are given.
+        losses: every term of the loss by name, when labels are given.
+        last_hidden_state: (B, T, P, 2C) tokens of the last frame layer and last global layer, joined.
+        pose_encoding: (B, T, 9) camera state: translation 3, quaternion xyzw 4 (not normalised),
+            field of view (vertical, horizontal); world-to-camera, OpenCV axes.
+        camera_iterations: translation and quaternion (B, T, 7) after each iteration, last one last.
+        hand_state: (B, T, 2, 109) camera-frame hands after the last iteration (see hand_state.py).
+        initial_hand_state: (B, T, 2, 109) camera-frame hands of the first iteration.
+        presence_logits: (B, T, 2), at or above 0 where a hand is in the picture.
+        hidden_states: (B, T, P, C) before the aggregator's first layer and after each one, frame and
+            global in turn, when asked for.
+        attentions: weights of the same layers, (BT, heads, P, P) of a frame layer and
+            (B, heads, TP, TP) of a global one, when asked for with eager attention.
+    """
+
+    loss: Tensor | None = None
+    losses: dict[str, Tensor] | None = None
+    last_hidden_state: Tensor | None = None
+    pose_encoding: Tensor | None = None
+    camera_iterations: tuple[Tensor, ...] | None = None
+    hand_state: Tensor | None = None
+    initial_hand_state: Tensor | None = None
+    presence_logits: Tensor | None = None
+    hidden_states: tuple[Tensor, ...] | None = None
+    attentions: tuple[Tensor, ...] | None = None
+
+
+class MintEncoder(nn.Module):
+    """Patch encoder: a ViT with register tokens (Oquab et al. 2023; Darcet et al. 2023)."""
+
+    def __init__(self, config: MintConfig):
+        super().__init__()
+        width, patch = config.hidden_size, config.patch_size
+        self.grid = config.position_grid
+        self.patch_embedding = nn.Conv2d(3, width, patch, stride=patch)
+        self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
+        self.register_tokens = nn.Parameter(torch.zeros(1, config.num_register_tokens, width))
+        self.position_embeddings = nn.Parameter(torch.zeros(1, 1 + self.grid**2, width))
+        # In the release and in DINOv2, for masked training; kept so that checkpoints are complete.
+        self.mask_token = nn.Parameter(torch.zeros(1, width), requires_grad=False)
+        self.layers = nn.ModuleList(
+            MintEncoderLayer(
+                width,
+                config.num_attention_heads,
+                eps=1e-6,
+                layer_scale=config.encoder_layer_scale,
+                small=False,
+            )
+            for _ in range(config.encoder_layers)
+        )
+        self.norm = nn.LayerNorm(width, eps=1e-6)
+
+    def positions(self, grid_hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
+        """Position embedding of the cls token (1, 1, C) and of a grid of patches (1, N, C)."""
+        cls, patches = self.position_embeddings.split([1, self.grid**2], 1)
+        if grid_hw != (self.grid, self.grid):
+            square = patches.float().unflatten(1, (self.grid, self.grid)).permute(0, 3, 1, 2)
+            resized = nn.functional.interpolate(
+                square, size=grid_hw, mode="bicubic", antialias=True, align_corners=False
+            )
+            patches = resized.flatten(2).transpose(1, 2).to(patches.dtype)
+        return cls, patches
+
+    def forward(self, frames: Tensor, implementation: str) -> Tensor:
+        """(F, 3, H, W) in [0, 1] -> (F, N, C)."""
+        mean, std = (
+            torch.tensor(values, dtype=torch.float32, device=frames.device).view(3, 1, 1)
+            for values in (IMAGE_MEAN, IMAGE_STD)
+        )
+        images = (frames - mean) / std
+        patches = self.patch_embedding(images.to(self.patch_embedding.weight.dtype))  # (F, C, h, w)
+        cls_position, patch_positions = self.positions(tuple(patches.shape[-2:]))
+        x = patches.flatten(2).transpose(1, 2) + patch_positions
+        count = x.shape[0]
+        specials = [
+            (self.cls_token + cls_position).expand(count, -1, -1),
+            self.register_tokens.expand(count, -1, -1),
+        ]
+        x = torch.cat([*specials, x], 1)
+        for layer in self.layers:
+            x = layer(x, implementation)
+        return self.norm(x)[:, 1 + self.register_tokens.shape[1] :]
+
+
+class MintAggregator(nn.Module):
+    """Pairs of a frame layer and a global layer over patch and special tokens."""
+
+    def __init__(self, config: MintConfig):
+        super().__init__()
+        width, registers = config.hidden_size, config.num_register_tokens
+        self.head_dim = width // config.num_attention_heads
+        # Slot 0 is for the first frame of a window, slot 1 for every later one.
+        self.camera_token = nn.Parameter(torch.zeros(1, 2, 1, width))
+        self.register_token = nn.Parameter(torch.zeros(1, 2, registers, width))
+        self.scale_token = nn.Parameter(torch.zeros(1, 2, 1, width))
+        options = {
+            "layer_scale": config.aggregator_layer_scale,
+            "qk_norm": True,
+            "small": False,
+        }
+        layers, heads = range(config.aggregator_layers), config.num_attention_heads
+        self.frame_layers = nn.ModuleList(MintFrameLayer(width, heads, **options) for _ in layers)
+        self.global_layers = nn.ModuleList(MintGlobalLayer(width, heads, **options) for _ in layers)
+
+    def forward(self, patches: Tensor, grid_hw: tuple[int, int], implementation: str) -> Tensor:
+        """(B, T, N, C) -> (B, T, P, 2C)."""
+        batch, frames = patches.shape[:2]
+        specials = torch.cat([self.camera_token, self.register_token, self.scale_token], 2)
+        first, later = specials.to(patches.dtype).split(1, 1)  # (1, 1, S, C) each
+        specials = torch.cat([first, later.expand(-1, frames - 1, -1, -1)], 1)
+        x = torch.cat([specials.expand(batch, -1, -1, -1), patches], 2)  # (B, T, P, C)
+        rotary = rotary_positions(grid_hw, specials.shape[2], self.head_dim, x.device)
+        within = x
+        for frame_layer, global_layer in zip(self.frame_layers, self.global_layers, strict=True):
+            within = frame_layer(x, implementation, rotary)
+            x = global_layer(within, implementation, rotary)
+        return torch.cat([within, x], -1)
+
+
+class MintPreTrainedModel(PreTrainedModel):
+    """Loading, saving and initialisation shared by MINT models."""
+
+    config: MintConfig
+    base_model_prefix = "mint"
+    main_input_name = "pixel_values"
+    input_modalities = ("video",)
+    supports_gradient_checkpointing = True
+    accepts_loss_kwargs = False
+    _no_split_modules = ["MintEncoderLayer", "MintFrameLayer", "MintGlobalLayer", "MintLayer"]  # noqa: RUF012
+    _keep_in_fp32_modules_strict = ["camera_head"]  # noqa: RUF012
+    _supports_sdpa = True
+    _supports_flash_attn = True
+    _supports_flex_attn = True
+    _supports_attention_backend = True
+    _can_compile_fullgraph = True
+    _can_record_outputs = {  # noqa: RUF012
+        "hidden_states": [MintFrameLayer, MintGlobalLayer],
+        "attentions": OutputRecorder(MintAttention, index=1, layer_name="aggregator"),
+    }
+
+    @classmethod
+    def from_pretrained(  # type: ignore[override]
+        cls, pretrained_model_name_or_path: str | Path | None, *args: Any, **kwargs: Any
+    ) -> Self:
+        """Load a folder or hub repository under our tensor names or the public release's.
+
+        Everything `PreTrainedModel.from_pretrained` takes, and:
+
+        Args:
+            pretrained_model_name_or_path: a folder or repository with `model.safetensors`; without
+                a `config.json` of ours it must have the release's shapes, or `config=` is needed.
+            strict: (keyword, default True) refuse missing, unexpected or misshapen tensors, listing
+                them; False loads what fits and lists the rest in a warning.
+
+        Raises:
+            ValueError: tensors that do not fit the configuration, or that hold NaN or infinity.
+        """
+        return load_checked(cls, super().from_pretrained, pretrained_model_name_or_path, *args, **kwargs)
+
+    def save_pretrained(self, save_directory: str | Path, *args: Any, **kwargs: Any) -> None:
+        """Save as `PreTrainedModel.save_pretrained` does, under our tensor names unless asked."""
+        kwargs.setdefault("save_original_format", False)
+        super().save_pretrained(save_directory, *args, **kwargs)
+
+    @torch.no_grad()
+    def _init_weights(self, module: nn.Module) -> None:
+        std = self.config.initializer_range
+        if isinstance(module, nn.Linear | nn.Conv2d):
+            init.trunc_normal_(module.weight, std=std)
+            if module.bias is not None:
+                init.zeros_(module.bias)
+        elif isinstance(module, nn.LayerNorm):
+            init.ones_(module.weight)
+            init.zeros_(module.bias)
+        elif isinstance(module, MintLayer) and module.initial_layer_scale is not None:
+            init.constant_(module.layer_scale1, module.initial_layer_scale)
+            init.constant_(module.layer_scale2, module.initial_layer_scale)
+        elif isinstance(module, MintEncoder):
+            for parameter in (module.cls_token, module.register_tokens):
+                init.normal_(parameter, std=1e-6)
+            init.trunc_normal_(module.position_embeddings, std=std)
+            init.zeros_(module.mask_token)
+        elif isinstance(module, MintAggregator):
+            for parameter in (module.camera_token, module.register_token, module.scale_token):
+                init.normal_(parameter, std=1e-6)
+        else:
+            self._init_head(module, std)
+
+    def _init_head(self, module: nn.Module, std: float) -> None:
+        """Heads start near a sensible answer: identity rotations, a usual field of view.
+
+        Called after the head's linear layers were initialised (children come first).
+        """
+        if isinstance(module, MintCameraHead):
+            init.zeros_(module.empty_pose)
+            bias = torch.zeros(7)
+            bias[6] = 1.0 / module.iterations  # the iterations add up: w = 1
+            init.copy_(module.pose_mlp.fc2.bias, bias)
+        elif isinstance(module, MintFovHead):
+            fov = torch.tensor([math.radians(degrees) for degrees in INITIAL_FOV_VH_DEG])
+            init.copy_(module.output.bias, torch.log(torch.expm1(fov - 1e-4)))
+        elif isinstance(module, MintHandHead):
+            init.normal_(module.queries, std=std)
+            init.zeros_(module.empty_state)
+            identity = torch.tensor([1.0, 0, 0, 0, 1, 0])
+            for name, joints in (("orientation", 1), ("pose", 15)):
+                init.copy_(module.absolute_heads[name].bias, identity.repeat(joints))
+            for head in module.increment_heads.values():
+                init.zeros_(head.weight)
+                init.zeros_(head.bias)
+        elif isinstance(module, MintPresenceHead):
+            init.normal_(module.queries, std=std)
+
+
+class MintModel(MintPreTrainedModel):
+    """The whole network: patch encoder, aggregator, and the camera, fov, hand and presence heads."""
+
+    def __init__(self, config: MintConfig):
+        super().__init__(config)
+        self.encoder = MintEncoder(config)
+        self.aggregator = MintAggregator(config)
+        self.camera_head = MintCameraHead(config)
+        self.fov_head = MintFovHead(config)
+        self.hand_head = MintHandHead(config)
+        self.presence_head = MintPresenceHead(config)
+        self.post_init()
+
+    @classmethod
+    def from_lingbot_map(cls, path: str | Path, config: MintConfig | None = None) -> Self:
+        """A fresh model whose encoder and aggregator come from `lingbot-map.pt`, as stage 1 starts.
+
+        Args:
+            path: the checkpoint, a torch pickle that is read with weights_only=True.
+            config: its sizes; the full model's by default.
+
+        Raises:
+            ValueError: the checkpoint lacks a tensor of the encoder or aggregator.
+        """
+        model = cls(config or MintConfig.full())
+        load_lingbot(model, path)
+        return model
+
+    def get_input_embeddings(self) -> nn.Module:
+        """The convolution that embeds patches."""
+        return self.encoder.patch_embedding
+
+    def encode_frames(self, pixel_values: Tensor) -> Tensor:
+        """Patch tokens of frames, each seen alone: (..., 3, H, W) in [0, 1] -> (..., N, C)."""
+        self._check_pixels(pixel_values)
+        leading = pixel_values.shape[:-3]
+        tokens = self.encoder(pixel_values.flatten(0, -4), self.config._attn_implementation)
+        return tokens.unflatten(0, leading)
+
+    @merge_with_config_defaults
+    @capture_outputs(tie_last_hidden_states=False)
+    @can_return_tuple
+    def forward(
+        self,
+        pixel_values: Tensor | None = None,
+        patch_tokens: Tensor | None = None,
+        grid_hw: tuple[int, int] | None = None,
+        labels: None = None,
+        **kwargs,
+    ) -> MintOutput:
+        """Run windows of frames, given as pixels or as patch tokens from `encode_frames`.
+
+        Args:
+            pixel_values: (B, T, 3, H, W) RGB in [0, 1]; H and W multiples of the patch size.
+            patch_tokens: (B, T, N, C), instead of pixel_values.
+            grid_hw: rows and columns of patches, with patch_tokens; the configuration's by default.
+            labels: reserved for training, which is not part of this version.
+
+        Returns:
+            MintOutput: see its attributes. The world is the camera of the window's first frame, as
+            far as the network has learnt it (frame 0 comes out near the identity, not exactly).
+
+        Raises:
+            ValueError: neither or both inputs, or shapes that do not fit the configuration.
+        """
+        if labels is not None:
+            raise ValueError("labels: losses are not part of this version; expected None")
+        if (pixel_values is None) == (patch_tokens is None):
+            raise ValueError("expected exactly one of pixel_values (B, T, 3, H, W) and patch_tokens")
+        implementation = self.config._attn_implementation
+        if patch_tokens is None:
+            if pixel_values.ndim != 5:
+                raise ValueError(
+                    f"pixel_values: expected (B, T, 3, H, W), got {tuple(pixel_values.shape)}"
+                )
+            patch = self.config.patch_size
+            patch_tokens = self.encode_frames(pixel_values)
+            grid_hw = (pixel_values.shape[-2] // patch, pixel_values.shape[-1] // patch)
+        else:
+            grid_hw = tuple(grid_hw or self.config.grid_hw)
+            expected = (grid_hw[0] * grid_hw[1], self.config.hidden_size)
+            if patch_tokens.ndim != 4 or tuple(patch_tokens.shape[-2:]) != expected:
+                raise ValueError(
+                    f"patch_tokens: expected (B, T, {expected[0]}, {expected[1]}) for a grid of "
+                    f"{grid_hw}, got {tuple(patch_tokens.shape)}"
+                )
+        tokens = self.aggregator(patch_tokens, grid_hw, implementation)
+        camera_tokens = tokens[:, :, 0]
+        poses = self.camera_head(camera_tokens, implementation)
+        fov = self.fov_head(camera_tokens, implementation)
+        hands = self.hand_head(tokens, implementation)
+        presence = self.presence_head(tokens[:, :, self.config.num_special_tokens :], implementation)
+        return MintOutput(
+            last_hidden_state=tokens,
+            pose_encoding=torch.cat([poses[-1], fov.to(poses[-1].dtype)], -1),
+            camera_iterations=poses,
+            hand_state=hands[-1],
+            initial_hand_state=hands[0],
+            presence_logits=presence,
+        )
+
+    def _check_pixels(self, pixel_values: Tensor) -> None:
+        patch = self.config.patch_size
+        shape = tuple(pixel_values.shape)
+        if len(shape) < 4 or shape[-3] != 3:
+            raise ValueError(f"pixel_values: expected (..., 3, H, W), got {shape}")
+        if shape[-2] % patch or shape[-1] % patch or not shape[-2] or not shape[-1]:
+            raise ValueError(
+                f"pixel_values: expected height and width that are multiples of the patch size "
+                f"{patch}, got {shape[-2]} x {shape[-1]}"
+            )
+
+
+register_conversion(MintModel.__name__)
+
+__all__ = ["MintModel", "MintOutput", "MintPreTrainedModel"]

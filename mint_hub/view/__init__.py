@@ -1,0 +1,1 @@
+"""Episodes made visible: overlay videos, plots, and interactive scenes."""
