@@ -1,6 +1,6 @@
 """The sizes of a MINT network, validated by name when they are made."""
 
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from huggingface_hub.dataclasses import strict
 from transformers.configuration_utils import PreTrainedConfig
@@ -32,6 +32,7 @@ class MintConfig(PreTrainedConfig):
         presence_hidden_size: width of the presence head.
         presence_heads: attention heads of the presence head.
         window: frames the network was trained to see at once.
+        shape_space: what the ten shape numbers mean, "mano" or "mint" (the licence-free hand).
         encoder_layer_scale: initial LayerScale of the patch encoder.
         aggregator_layer_scale: initial LayerScale of the aggregator and of the camera head.
         initializer_range: standard deviation of freshly initialised linear weights.
@@ -64,6 +65,7 @@ class MintConfig(PreTrainedConfig):
     presence_hidden_size: int = 256
     presence_heads: int = 4
     window: int = 32
+    shape_space: Literal["mano", "mint"] = "mano"
     encoder_layer_scale: float = 1.0
     aggregator_layer_scale: float = 0.01
     initializer_range: float = 0.02
@@ -138,6 +140,7 @@ class MintConfig(PreTrainedConfig):
             "hand_hidden_size": 192,
             "hand_heads": 6,
             "presence_hidden_size": 96,
+            "shape_space": "mint",
         }
         return cls(**(sizes | overrides))
 

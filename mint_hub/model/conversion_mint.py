@@ -5,7 +5,7 @@ registered with transformers, so that `MintModel.from_pretrained` reads a folder
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,8 @@ from safetensors import safe_open
 from torch import Tensor
 from transformers.conversion_mapping import register_checkpoint_conversion_mapping
 from transformers.core_model_loading import WeightRenaming
-from transformers.utils import cached_file, logging
 
 from .configuration_mint import MintConfig
-
-logger = logging.get_logger(__name__)
 
 RENAMES: tuple[tuple[str, str], ...] = (
     # The trunk.
@@ -108,7 +105,9 @@ def read_layout(source: str | Path, **hub: Any) -> dict[str, tuple[int, ...]]:
         }
     files = sorted(folder.glob("*.safetensors"))
     if not files:
-        raise FileNotFoundError(f"{folder}: expected model.safetensors, found no *.safetensors file")
+        raise FileNotFoundError(
+            f"{folder}: expected model.safetensors, found no *.safetensors file"
+        )
     layout: dict[str, tuple[int, ...]] = {}
     for file in files:
         with safe_open(file, "pt") as handle:
@@ -213,78 +212,56 @@ def load_lingbot(model: torch.nn.Module, path: str | Path) -> dict[str, list[str
     }
 
 
-def load_checked(
-    cls: Any, load: Callable[..., Any], source: str | Path | None, *args: Any, **kwargs: Any
-) -> Any:
-    """Call transformers' own `from_pretrained`, then refuse what does not fit.
+def convert_checkpoint(
+    source: str | Path,
+    out: Path,
+    *,
+    config: str | Path | None = None,
+    dtype: str | None = None,
+    revision: str | None = None,
+) -> list[str]:
+    """Write a checkpoint made elsewhere as a folder in our format: config, weights, processor.
 
     Args:
-        cls: the model class, for messages.
-        load: the bound `PreTrainedModel.from_pretrained`.
-        source: folder, repository, or None when `state_dict` is given (then nothing is checked: the
-            caller chose the tensors).
-        args: passed on.
-        kwargs: passed on; `strict` (default True) is ours.
+        source: folder or hub repository with `model.safetensors` under either naming; or a
+            LingBot-Map `.pt` file, whose encoder and aggregator are taken and whose heads start
+            afresh (seed 0).
+        out: folder to write; it must not exist yet, or be empty.
+        config: a configuration (folder or `config.json`) for weights that come without one.
+        dtype: "float32", "bfloat16" or "float16"; as stored when None.
+        revision: of a hub repository.
+
+    Returns:
+        Lines that say what was read and written.
 
     Raises:
-        ValueError: see `MintPreTrainedModel.from_pretrained`.
+        ValueError: weights that do not fit, or an `out` that holds something.
+        FileNotFoundError: no such source.
     """
-    strict = kwargs.pop("strict", True)
-    want_info = kwargs.pop("output_loading_info", False)
-    if source is None:
-        return load(source, *args, output_loading_info=want_info, **kwargs)
-    if kwargs.get("config") is None and not _has_config(source, kwargs):
-        hub = {k: kwargs[k] for k in ("revision", "token") if kwargs.get(k) is not None}
-        kwargs["config"] = config_from_layout(read_layout(source, **hub), source)
-    forgive = kwargs.pop("ignore_mismatched_sizes", not strict)
-    # Sizes are forgiven while loading so that all faults are listed together, then refused here.
-    model, info = load(
-        source, *args, output_loading_info=True, ignore_mismatched_sizes=True, **kwargs
-    )
-    faults = _describe_faults(info, count_mismatched=not forgive)
-    if faults and strict:
-        raise ValueError(f"{source}: these weights do not fit {cls.__name__}: {faults}")
-    if faults:
-        logger.warning("%s: loaded what fits %s; %s", source, cls.__name__, faults)
-    broken = [
-        name
-        for name, tensor in model.state_dict().items()
-        if not tensor.is_meta and tensor.is_floating_point() and not torch.isfinite(tensor.sum())
-        and not torch.isfinite(tensor).all()
-    ]
-    if broken:
-        raise ValueError(
-            f"{source}: NaN or infinity in {len(broken)} tensors: {_some(broken)}. "
-            "The file is damaged or its training diverged"
-        )
-    return (model, info) if want_info else model
+    from .loading_mint import cast_weights, first_names
+    from .modeling_mint import MintModel
+    from .processing_mint import MintProcessor
 
-
-def _has_config(source: str | Path, kwargs: Mapping[str, Any]) -> bool:
-    keys = ("revision", "token", "cache_dir", "local_files_only", "subfolder", "force_download")
-    options = {k: kwargs[k] for k in keys if kwargs.get(k) is not None}
-    found = cached_file(
-        str(source),
-        "config.json",
-        _raise_exceptions_for_missing_entries=False,
-        **options,
-    )
-    return found is not None
-
-
-def _describe_faults(info: Mapping[str, Any], count_mismatched: bool) -> str:
-    parts = []
-    for kind in ("missing", "unexpected"):
-        if names := sorted(info[f"{kind}_keys"]):
-            parts.append(f"{len(names)} {kind}: {_some(names)}")
-    mismatched = sorted(info["mismatched_keys"]) if count_mismatched else []
-    if mismatched:
-        shapes = [f"{name} (expected {tuple(own)}, got {tuple(got)})" for name, got, own in mismatched]
-        parts.append(f"{len(mismatched)} of another shape: {_some(shapes)}")
-    return "; ".join(parts)
-
-
-def _some(names: Sequence[str], most: int = 8) -> str:
-    """The first names of a list, and how many more."""
-    rest = len(names) - most
-    return ", ".join(names[:most]) + (f", and {rest} more" if rest > 0 else "")
+    if out.exists() and any(out.iterdir()):
+        raise ValueError(f"{out}: expected a new or empty folder, got one that holds files")
+    if dtype not in (None, "float32", "bfloat16", "float16"):
+        raise ValueError(f"dtype: expected float32, bfloat16 or float16, got {dtype!r}")
+    sizes = None if config is None else MintConfig.from_pretrained(config)
+    lines = []
+    if str(source).endswith((".pt", ".pth", ".bin")):
+        torch.manual_seed(0)
+        model = MintModel(sizes or MintConfig.full())
+        report = load_lingbot(model, source)
+        lines += [f"{kind}: {len(names)} tensors" for kind, names in report.items()]
+        lines.append(f"freshly initialised (seed 0): {first_names(report['kept'])}")
+        if report["unused"]:
+            lines.append(f"not used: {first_names(report['unused'])}")
+    else:
+        options = {} if revision is None else {"revision": revision}
+        model = MintModel.from_pretrained(source, config=sizes, **options)
+    if dtype is not None:
+        cast_weights(model, getattr(torch, dtype))
+    model.save_pretrained(out)
+    MintProcessor.for_config(model.config).save_pretrained(out)
+    parameters = sum(p.numel() for p in model.parameters())
+    return [*lines, f"wrote {len(model.state_dict())} tensors, {parameters:,} parameters, to {out}"]

@@ -64,7 +64,9 @@ class MintCameraHead(nn.Module):
             tokens = self.token_norm(camera_tokens.to(self.token_norm.weight.dtype))
             poses: list[Tensor] = []
             for _ in range(self.iterations):
-                seen = poses[-1].detach() if poses else self.empty_pose.expand(*tokens.shape[:2], -1)
+                seen = (
+                    poses[-1].detach() if poses else self.empty_pose.expand(*tokens.shape[:2], -1)
+                )
                 condition = nn.functional.silu(self.embed_pose(seen))
                 x = modulate(tokens, self.modulation(condition))
                 for layer in self.layers:
@@ -72,6 +74,10 @@ class MintCameraHead(nn.Module):
                 step = self.pose_mlp(self.layers_norm(x))
                 poses.append(poses[-1] + step if poses else step)
             return tuple(poses)
+
+
+class MintFovOutput(nn.Linear):
+    """The last layer of the field-of-view head; a class of its own because it starts differently."""
 
 
 class MintFovHead(nn.Module):
@@ -86,7 +92,7 @@ class MintFovHead(nn.Module):
             MintLayer(width, config.fov_heads) for _ in range(config.fov_layers)
         )
         self.output_norm = nn.LayerNorm(width)
-        self.output = nn.Linear(width, 2)
+        self.output = MintFovOutput(width, 2)
 
     def forward(self, camera_tokens: Tensor, implementation: str) -> Tensor:
         """(B, T, W) -> (B, T, 2) radians (vertical, horizontal), float32."""

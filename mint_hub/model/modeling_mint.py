@@ -22,11 +22,12 @@ from transformers.utils.generic import can_return_tuple, merge_with_config_defau
 from transformers.utils.output_capturing import OutputRecorder, capture_outputs
 
 from .configuration_mint import MintConfig
-from .conversion_mint import load_checked, load_lingbot, register_conversion
+from .conversion_mint import load_lingbot, register_conversion
 from .heads_mint import (
     INITIAL_FOV_VH_DEG,
     MintCameraHead,
     MintFovHead,
+    MintFovOutput,
     MintHandHead,
     MintPresenceHead,
 )
@@ -38,6 +39,7 @@ from .layers_mint import (
     MintLayer,
     rotary_positions,
 )
+from .loading_mint import load_checked
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
 IMAGE_STD = (0.229, 0.224, 0.225)
@@ -205,7 +207,9 @@ class MintPreTrainedModel(PreTrainedModel):
         Raises:
             ValueError: tensors that do not fit the configuration, or that hold NaN or infinity.
         """
-        return load_checked(cls, super().from_pretrained, pretrained_model_name_or_path, *args, **kwargs)
+        return load_checked(
+            cls, super().from_pretrained, pretrained_model_name_or_path, *args, **kwargs
+        )
 
     def save_pretrained(self, save_directory: str | Path, *args: Any, **kwargs: Any) -> None:
         """Save as `PreTrainedModel.save_pretrained` does, under our tensor names unless asked."""
@@ -215,7 +219,11 @@ class MintPreTrainedModel(PreTrainedModel):
     @torch.no_grad()
     def _init_weights(self, module: nn.Module) -> None:
         std = self.config.initializer_range
-        if isinstance(module, nn.Linear | nn.Conv2d):
+        if isinstance(module, MintFovOutput):
+            init.normal_(module.weight, std=0.02)
+            fov = torch.tensor([math.radians(degrees) for degrees in INITIAL_FOV_VH_DEG])
+            init.copy_(module.bias, torch.log(torch.expm1(fov - 1e-4)))  # undo the softplus
+        elif isinstance(module, nn.Linear | nn.Conv2d):
             init.trunc_normal_(module.weight, std=std)
             if module.bias is not None:
                 init.zeros_(module.bias)
@@ -237,18 +245,16 @@ class MintPreTrainedModel(PreTrainedModel):
             self._init_head(module, std)
 
     def _init_head(self, module: nn.Module, std: float) -> None:
-        """Heads start near a sensible answer: identity rotations, a usual field of view.
+        """Heads start near a sensible answer: identity rotations, no motion, no increments.
 
-        Called after the head's linear layers were initialised (children come first).
+        Called after the head's linear layers were initialised (children come first), and only for
+        modules that hold parameters of their own.
         """
         if isinstance(module, MintCameraHead):
             init.zeros_(module.empty_pose)
             bias = torch.zeros(7)
             bias[6] = 1.0 / module.iterations  # the iterations add up: w = 1
             init.copy_(module.pose_mlp.fc2.bias, bias)
-        elif isinstance(module, MintFovHead):
-            fov = torch.tensor([math.radians(degrees) for degrees in INITIAL_FOV_VH_DEG])
-            init.copy_(module.output.bias, torch.log(torch.expm1(fov - 1e-4)))
         elif isinstance(module, MintHandHead):
             init.normal_(module.queries, std=std)
             init.zeros_(module.empty_state)
@@ -330,7 +336,9 @@ class MintModel(MintPreTrainedModel):
         if labels is not None:
             raise ValueError("labels: losses are not part of this version; expected None")
         if (pixel_values is None) == (patch_tokens is None):
-            raise ValueError("expected exactly one of pixel_values (B, T, 3, H, W) and patch_tokens")
+            raise ValueError(
+                "expected exactly one of pixel_values (B, T, 3, H, W) and patch_tokens"
+            )
         implementation = self.config._attn_implementation
         if patch_tokens is None:
             if pixel_values.ndim != 5:
@@ -353,7 +361,9 @@ class MintModel(MintPreTrainedModel):
         poses = self.camera_head(camera_tokens, implementation)
         fov = self.fov_head(camera_tokens, implementation)
         hands = self.hand_head(tokens, implementation)
-        presence = self.presence_head(tokens[:, :, self.config.num_special_tokens :], implementation)
+        presence = self.presence_head(
+            tokens[:, :, self.config.num_special_tokens :], implementation
+        )
         return MintOutput(
             last_hidden_state=tokens,
             pose_encoding=torch.cat([poses[-1], fov.to(poses[-1].dtype)], -1),

@@ -1,0 +1,243 @@
+"""Many videos to a folder of results: resumable, one bad video never stops the others.
+
+Each video gets a folder named by its key, with ``episode.npz`` and, beside it, the overlay
+``episode.mp4``, the plot ``episode.png`` and the page ``episode.html``. Last of all comes
+``done.json``: a video is finished when that file is there and says the same source, model and
+settings. Failures are collected and returned.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tqdm.auto import tqdm
+
+from mint_hub.inference.runner import MintRunner, RunSettings
+from mint_hub.inference.video_input import key_from_name
+from mint_hub.loaders.atomic import replacing
+from mint_hub.loaders.schema import Episode
+from mint_hub.view.overlay import write_overlay
+from mint_hub.view.plots import write_trajectory_plot
+from mint_hub.view.scene import write_rrd
+from mint_hub.view.summary import write_index, write_summary
+
+VIDEO_SUFFIXES = frozenset(
+    {".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v", ".mpg", ".mpeg", ".ts"}
+)
+DONE = "done.json"
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Which files to write beside the episode.
+
+    Attributes:
+        overlay: skeletons over the frames, ``episode.mp4``.
+        plots: world trajectories, ``episode.png``, and the one-page summary ``episode.html``.
+        rerun: an interactive scene, ``episode.rrd`` (needs the extra ``viz``).
+
+    """
+
+    overlay: bool = True
+    plots: bool = True
+    rerun: bool = False
+
+
+@dataclass
+class BatchReport:
+    """What became of each video.
+
+    Attributes:
+        done: folders written in this run.
+        skipped: folders that were finished before.
+        failed: (video, error) pairs.
+
+    """
+
+    done: list[Path] = field(default_factory=list[Path])
+    skipped: list[Path] = field(default_factory=list[Path])
+    failed: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+
+
+def find_videos(inputs: Iterable[str | Path]) -> dict[str, str]:
+    """Videos by key: files and URLs as given, folders searched for video files, in order.
+
+    Keys come from names (paths below the folder for a folder); two of one name get the start of a
+    hash of their path, so that results never overwrite each other and resume under the same key.
+
+    Raises:
+        ValueError: a folder without videos, or nothing at all.
+
+    """
+    named: list[tuple[str, str]] = []
+    for item in map(str, inputs):
+        folder = Path(item)
+        if not folder.is_dir():
+            named.append((key_from_name(item), item))
+            continue
+        files = sorted(
+            p for p in folder.rglob("*") if p.suffix.lower() in VIDEO_SUFFIXES and p.is_file()
+        )
+        if not files:
+            raise ValueError(
+                f"{folder}: expected a folder with videos ({', '.join(sorted(VIDEO_SUFFIXES))}), "
+                "found none"
+            )
+        named += [
+            ("_".join(map(key_from_name, p.relative_to(folder).parts)), str(p)) for p in files
+        ]
+    if not named:
+        raise ValueError("videos: expected at least one file, folder or URL, got none")
+    unique = dict.fromkeys(named)
+    counts: dict[str, int] = {}
+    for key, _ in unique:
+        counts[key] = counts.get(key, 0) + 1
+    return {
+        key if counts[key] == 1 else f"{key}-{hashlib.sha256(path.encode()).hexdigest()[:8]}": path
+        for key, path in unique
+    }
+
+
+def predict_videos(
+    videos: dict[str, str],
+    folder: Path,
+    runner: MintRunner,
+    settings: RunSettings,
+    *,
+    outputs: Outputs | None = None,
+    overwrite: bool = False,
+    progress: bool = True,
+    say: Callable[[str], None] | None = None,
+    **options: Any,
+) -> BatchReport:
+    """Predict every video and write its results below ``folder``.
+
+    Args:
+        videos: path or URL by key (see `find_videos`).
+        folder: where results go; made if needed.
+        runner: the model.
+        settings: how to run it.
+        outputs: which files to write.
+        overwrite: do finished videos again.
+        progress: show bars on standard error.
+        say: called with a line for each video.
+        options: `camera`, `camera_poses`, `warnings` for `MintRunner.run`.
+
+    Returns:
+        BatchReport: what was done, skipped, and failed. An interruption (KeyboardInterrupt) is
+        raised through; what was finished stays finished.
+
+    """
+    outputs = outputs or Outputs()
+    say = say or (lambda _: None)
+    report = BatchReport()
+    folder.mkdir(parents=True, exist_ok=True)
+    bar = tqdm(videos.items(), unit="video", disable=not progress or len(videos) == 1)
+    for key, path in bar:
+        target = folder / key
+        wanted = _fingerprint(path, runner, settings, outputs, options)
+        if not overwrite and _finished(target, wanted):
+            report.skipped.append(target)
+            say(f"{key}: finished before, skipped")
+            continue
+        try:
+            episode = runner.run(path, settings, key=key, progress=progress, **options)
+            _write(episode, path, target, runner, outputs, progress)
+            _mark_done(target, wanted)
+        except (ValueError, OSError, RuntimeError, ImportError) as error:
+            report.failed.append((path, str(error)))
+            say(f"{key}: failed: {error}")
+            continue
+        report.done.append(target)
+        say(f"{episode!r} -> {target}")
+    if outputs.plots and (report.done or report.skipped):
+        write_index(folder)
+    return report
+
+
+def _write(
+    episode: Episode,
+    video: str,
+    target: Path,
+    runner: MintRunner,
+    outputs: Outputs,
+    progress: bool,
+) -> None:
+    target.mkdir(parents=True, exist_ok=True)
+    (target / DONE).unlink(missing_ok=True)
+    episode.save(target / "episode.npz")
+    overlay = None
+    if outputs.overlay:
+        with tqdm(total=episode.num_frames, unit="frame", desc="overlay", leave=False,
+                  disable=not progress) as bar:  # fmt: skip
+            overlay = write_overlay(
+                episode,
+                video,
+                target / "episode.mp4",
+                hand_model=runner.hand_model,
+                progress=lambda *_: bar.update(),
+            )
+    if outputs.plots:
+        write_trajectory_plot(episode, target / "episode.png")
+        write_summary(
+            episode,
+            target / "episode.html",
+            video=video,
+            overlay=overlay,
+            hand_model=runner.hand_model,
+        )
+    if outputs.rerun:
+        write_rrd(episode, target / "episode.rrd", video=video, hand_model=runner.hand_model)
+
+
+def _fingerprint(
+    path: str,
+    runner: MintRunner,
+    settings: RunSettings,
+    outputs: Outputs,
+    options: dict[str, Any],
+) -> dict[str, Any]:
+    """What a result depends on, as plain JSON; unequal means it has to be made again."""
+    file = Path(path)
+    stat = file.stat() if file.is_file() else None
+    config = runner.models[0].config
+    wanted = {
+        "source": path if stat is None else str(file.resolve()),
+        "bytes": None if stat is None else stat.st_size,
+        "modified_ns": None if stat is None else stat.st_mtime_ns,
+        "model": str(config._name_or_path),  # pyright: ignore
+        "weights": _weights_stamp(str(config._name_or_path)),  # pyright: ignore
+        "revision": getattr(config, "_commit_hash", None),
+        "dtype": str(runner.models[0].dtype),
+        "hand_model": runner.hand_model.name,
+        "settings": asdict(settings),
+        "outputs": asdict(outputs),
+        "options": {k: repr(v) for k, v in sorted(options.items())},
+    }
+    return json.loads(json.dumps(wanted))
+
+
+def _weights_stamp(model: str) -> list[tuple[str, int, int]]:
+    """Names, sizes and times of a local checkpoint's files; a hub's revision says it otherwise."""
+    files = sorted(Path(model).glob("*.safetensors")) if model and Path(model).is_dir() else []
+    return [(f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in files]
+
+
+def _finished(target: Path, wanted: dict[str, Any]) -> bool:
+    try:
+        return json.loads((target / DONE).read_text()) == wanted
+    except (OSError, json.JSONDecodeError):
+        return False
+
+
+def _mark_done(target: Path, wanted: dict[str, Any]) -> None:
+    with replacing(target / DONE) as temporary:
+        temporary.write_text(json.dumps(wanted, indent=1))
+
+
+def failures_text(failed: Sequence[tuple[str, str]]) -> str:
+    """The failures of a run, a line each."""
+    return "\n".join(f"  {video}: {error}" for video, error in failed)
