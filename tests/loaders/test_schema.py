@@ -1,3 +1,4 @@
+import doctest
 import hashlib
 import io
 import json
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from mint_hub.geometry import hand_state
 from mint_hub.geometry.camera import project
 from mint_hub.geometry.hand_model import HandModel
+from mint_hub.loaders import schema
 from mint_hub.loaders.schema import (
     ARRAY_FIELDS,
     SCHEMA_VERSION,
@@ -89,9 +91,17 @@ def _with(array, index, value):
         ("image_size_hw", lambda _: (480, 0), "positive sizes"),
         ("image_size_hw", lambda _: (480.0, 640), "whole number, got 480.0"),
         ("image_size_hw", lambda _: 480, "expected \\(height, width\\)"),
-        ("text", lambda _: (TextSegment("x", "", None, 0, 25),), "'x' end: expected at most T = 24"),
+        (
+            "text",
+            lambda _: (TextSegment("x", "", None, 0, 25),),
+            "'x' end: expected at most T",
+        ),
         ("text", lambda _: ({"id": "x"},), "expected TextSegments"),
-        ("meta", lambda _: {"a": [{"b": float("nan")}]}, r"meta\['a'\]\[0\]\['b'\]: expected a JSON"),
+        (
+            "meta",
+            lambda _: {"a": [{"b": float("nan")}]},
+            r"meta\['a'\]\[0\]\['b'\]: expected",
+        ),
         ("meta", lambda _: {"a": np.float32(1)}, r"meta\['a'\]: expected a JSON value"),
         ("meta", lambda _: {1: 2}, "expected names as keys, got 1"),
         ("meta", lambda _: {"fps": -1}, "expected a positive number, got -1"),
@@ -138,7 +148,9 @@ def test_rate_comes_from_meta_else_from_the_timestamps(episode):
 
 def test_world_and_camera_agree(episode):
     T = episode.T_camera_from_world
-    np.testing.assert_allclose(T @ episode.T_world_from_camera, np.tile(np.eye(4), (24, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(
+        T @ episode.T_world_from_camera, np.tile(np.eye(4), (24, 1, 1)), atol=1e-9
+    )
     np.testing.assert_allclose(
         T[:, None] @ episode.wrist_world(), episode.wrist_camera(), atol=1e-9
     )
@@ -173,12 +185,15 @@ def test_world_hand_states_give_the_world_joints(episode):
     joints = np.asarray(model.keypoints(episode.hand_state_world()))
     there = episode.presence
     np.testing.assert_allclose(joints[there], episode.joints_world(model)[there], atol=1e-5)
-    world, stored = hand_state.unpack(episode.hand_state_world()), hand_state.unpack(episode.hand_state)
+    world, stored = (
+        hand_state.unpack(episode.hand_state_world()),
+        hand_state.unpack(episode.hand_state),
+    )
     np.testing.assert_array_equal(world.joint_rot6d_rows, stored.joint_rot6d_rows)
     np.testing.assert_array_equal(world.shape_params, stored.shape_params)
 
 
-def test_K_sees_the_edge_of_the_field_of_view_at_the_edge_of_the_image(episode):
+def test_k_sees_the_edge_of_the_field_of_view_at_the_edge_of_the_image(episode):
     vertical, horizontal = episode.fov_vh_rad.astype(float).T / 2
     corner = np.stack([np.tan(horizontal), np.tan(vertical), np.ones(24)], axis=-1)
     for k in range(24):
@@ -240,7 +255,10 @@ def test_allclose_sees_every_field(episode):
 # -------------------------------------------------------------- dict, file
 
 json_values = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False)
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=False, allow_infinity=False)
     | st.text(),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
     max_leaves=8,
@@ -254,7 +272,9 @@ json_values = st.recursive(
     text=st.text(),
     extra=json_values,
 )
-def test_file_and_dict_give_back_the_episode(tmp_path_factory, num_frames, seed, scored, text, extra):
+def test_file_and_dict_give_back_the_episode(
+    tmp_path_factory, num_frames, seed, scored, text, extra
+):
     segment = TextSegment("ü", text, None, 0, num_frames)
     made = replace(make_episode(num_frames, seed, meta={"extra": extra}), text=(segment,))
     if not scored:
@@ -325,8 +345,16 @@ class _Bomb:
         ("", {"surprise": 1}, "surprise: expected a field of an episode"),
         ("", {"key": np.array([_Bomb()], dtype=object)}, "key: expected a plain npy array"),
         ("", {"schema_version": 1.5}, "schema_version: expected a whole number"),
-        ("", {"presence": np.zeros((3, 2), bool)}, r"presence: expected shape \(T, 2\) with T = 24"),
-        ("", {"schema_version": SCHEMA_VERSION + 1}, "expected at most 1, got 2: written by a newer"),
+        (
+            "",
+            {"presence": np.zeros((3, 2), bool)},
+            r"presence: expected shape \(T, 2\) with T = 24",
+        ),
+        (
+            "",
+            {"schema_version": SCHEMA_VERSION + 1},
+            "at most 1, got 2: written by a newer",
+        ),
     ],
 )
 def test_tampered_files_are_refused(episode, tmp_path, drop, members, message):
@@ -359,3 +387,7 @@ def test_a_missing_file_says_so(tmp_path):
 
 def test_episodes_travel_between_processes(episode):
     assert pickle.loads(pickle.dumps(episode)).allclose(episode, atol=0)
+
+
+def test_the_examples_in_the_docs_hold():
+    assert doctest.testmod(schema).failed == 0
