@@ -8,12 +8,12 @@ from transformers.configuration_utils import PreTrainedConfig
 
 @strict
 class MintConfig(PreTrainedConfig):
-    """Configuration of `MintModel`; the defaults are the public release's (1.14 billion parameters).
+    """Configuration of `MintModel`; the defaults are the public release's (1.14 B parameters).
 
     Args:
-        image_size: (height, width) of a frame as the network sees it, pixels; multiples of patch_size.
+        image_size: (height, width) of a frame as the network sees it, multiples of patch_size.
         patch_size: side of a square patch, pixels.
-        position_grid: side, in patches, of the square grid the position embedding was trained on.
+        position_grid: side, in patches, of the square grid of the position embedding.
         hidden_size: width C of the patch encoder and of the aggregator.
         num_attention_heads: heads in the encoder, frame and global layers.
         encoder_layers: depth of the patch encoder.
@@ -28,7 +28,7 @@ class MintConfig(PreTrainedConfig):
         hand_hidden_size: width of the hand head.
         hand_heads: attention heads of the hand head.
         hand_layers: self-attention layers over the eight hand queries.
-        hand_iterations: iterations of the hand head; the first is absolute, later ones are increments.
+        hand_iterations: iterations of the hand head; the first is absolute, later ones increments.
         presence_hidden_size: width of the presence head.
         presence_heads: attention heads of the presence head.
         window: frames the network was trained to see at once.
@@ -42,7 +42,7 @@ class MintConfig(PreTrainedConfig):
     """
 
     model_type = "mint"
-    attribute_map = {"num_hidden_layers": "aggregator_layers"}  # noqa: RUF012 (transformers' own protocol)
+    attribute_map = {"num_hidden_layers": "aggregator_layers"}  # noqa: RUF012 (transformers' way)
 
     image_size: list[int] | tuple[int, int] = (378, 518)
     patch_size: int = 14
@@ -72,6 +72,10 @@ class MintConfig(PreTrainedConfig):
 
     def __post_init__(self, **kwargs: Any) -> None:
         self.image_size = list(self.image_size)
+        if __name__.startswith("mint_hub."):
+            # A repository may carry a copy of the code; where the package runs, none refers to it.
+            for name in ("auto_map", "custom_pipelines"):
+                kwargs.pop(name, None)
         super().__post_init__(**kwargs)
 
     def validate_architecture(self) -> None:
@@ -117,6 +121,11 @@ class MintConfig(PreTrainedConfig):
     def num_special_tokens(self) -> int:
         """Tokens before a frame's patches: one camera, the registers, one scale."""
         return self.num_register_tokens + 2
+
+    @property
+    def num_recorded_layers(self) -> int:
+        """Layers whose hidden states and attentions can be returned: both kinds of every pair."""
+        return 2 * self.aggregator_layers
 
     @classmethod
     def full(cls, **overrides: Any) -> Self:

@@ -1,7 +1,7 @@
 """Checkpoints made elsewhere, under our names: the public release, and LingBot-Map as a start.
 
-`RENAMES` is the one table from the release's tensor names to ours, applied from top to bottom. It is
-registered with transformers, so that `MintModel.from_pretrained` reads a folder under either naming.
+`RENAMES` is the one table from the release's tensor names to ours, applied from top to bottom. It
+is registered with transformers, so that `MintModel.from_pretrained` reads either naming.
 """
 
 import re
@@ -19,18 +19,19 @@ from transformers.core_model_loading import WeightRenaming
 from .configuration_mint import MintConfig
 
 RENAMES: tuple[tuple[str, str], ...] = (
-    # The trunk.
-    (r"^backbone\.aggregator\.patch_embed\.", "encoder."),
-    (r"^encoder\.patch_embed\.proj\.", "encoder.patch_embedding."),
-    (r"^encoder\.pos_embed", "encoder.position_embeddings"),
-    (r"^backbone\.aggregator\.", "aggregator."),
+    # The trunk: in each family the rest first, then the named ones, so that either way round a name
+    # is renamed once.
+    (r"^backbone\.aggregator\.patch_embed\.(?!patch_embed\.|pos_embed|blocks\.)", "encoder."),
+    (r"^backbone\.aggregator\.patch_embed\.patch_embed\.proj\.", "encoder.patch_embedding."),
+    (r"^backbone\.aggregator\.patch_embed\.pos_embed", "encoder.position_embeddings"),
+    (r"^backbone\.aggregator\.patch_embed\.blocks\.", "encoder.layers."),
+    (r"^backbone\.aggregator\.(?!patch_embed\.|frame_blocks\.|global_blocks\.)", "aggregator."),
+    (r"^backbone\.aggregator\.frame_blocks\.", "aggregator.frame_layers."),
+    (r"^backbone\.aggregator\.global_blocks\.", "aggregator.global_layers."),
     (r"^backbone\.camera_head\.", "camera_head."),
     (r"^backbone\.fov_head\.", "fov_head."),
     (r"^hand_presence_head\.", "presence_head."),
     # Layers.
-    (r"^aggregator\.frame_blocks\.", "aggregator.frame_layers."),
-    (r"^aggregator\.global_blocks\.", "aggregator.global_layers."),
-    (r"^encoder\.blocks\.", "encoder.layers."),
     (r"_head\.trunk\.", "_head.layers."),
     (r"\.attn\.qkv\.", ".attention.qkv."),
     (r"\.attn\.q_norm\.", ".attention.q_norm."),
@@ -39,15 +40,15 @@ RENAMES: tuple[tuple[str, str], ...] = (
     (r"\.ls1\.gamma", ".layer_scale1"),
     (r"\.ls2\.gamma", ".layer_scale2"),
     # Heads.
-    (r"^camera_head\.empty_pose_tokens", "camera_head.empty_pose"),
-    (r"^camera_head\.trunk_norm\.", "camera_head.layers_norm."),
-    (r"^camera_head\.poseLN_modulation\.1\.", "camera_head.modulation."),
-    (r"^camera_head\.pose_branch\.", "camera_head.pose_mlp."),
+    (r"camera_head\.empty_pose_tokens", "camera_head.empty_pose"),
+    (r"camera_head\.trunk_norm\.", "camera_head.layers_norm."),
+    (r"camera_head\.poseLN_modulation\.1\.", "camera_head.modulation."),
+    (r"camera_head\.pose_branch\.", "camera_head.pose_mlp."),
     (r"^hand_head\.empty_pred", "hand_head.empty_state"),
     (r"^hand_head\.embed_pred\.", "hand_head.embed_state."),
     (r"^hand_head\.adaln_mod\.1\.", "hand_head.modulation."),
     (r"^hand_head\.query(?!s)", "hand_head.queries"),
-    (r"^presence_head\.query(?!s)", "presence_head.queries"),
+    (r"presence_head\.query(?!s)", "presence_head.queries"),
     (r"\.cross_attn\.in_proj_weight", ".cross_attention.qkv.weight"),
     (r"\.cross_attn\.in_proj_bias", ".cross_attention.qkv.bias"),
     (r"\.cross_attn\.out_proj\.", ".cross_attention.out."),
@@ -62,8 +63,8 @@ RENAMES: tuple[tuple[str, str], ...] = (
 )
 """(pattern of the release's names, replacement), every one applied in order to every key.
 
-Each step can be undone, so that transformers can also write the release's names
-(`save_pretrained(..., save_original_format=True)`)."""
+Every pattern finds its tensors under their released names, and each step can be undone, so that
+transformers can also write those (`save_pretrained(..., save_original_format=True)`)."""
 
 RELEASE_MARKER = "backbone.aggregator.camera_token"
 """A tensor name that every checkpoint under the release's naming has, and none of ours."""
@@ -111,7 +112,7 @@ def read_layout(source: str | Path, **hub: Any) -> dict[str, tuple[int, ...]]:
     layout: dict[str, tuple[int, ...]] = {}
     for file in files:
         with safe_open(file, "pt") as handle:
-            layout |= {k: tuple(handle.get_slice(k).get_shape()) for k in handle.keys()}
+            layout |= {k: tuple(handle.get_slice(k).get_shape()) for k in handle.keys()}  # noqa: SIM118
     return layout
 
 
@@ -135,11 +136,11 @@ def config_from_layout(layout: Mapping[str, tuple[int, ...]], source: object) ->
         key for key in expected if expected[key] != got[key]
     )
     first = differing[0]
+    shapes = f"expected {expected.get(first, 'absent')}, got {got.get(first, 'absent')}"
     raise ValueError(
         f"{source}: has weights but no config.json of ours, and they are not the public release's "
-        f"({len(differing)} tensors differ, first {first}: expected {expected.get(first, 'absent')}, "
-        f"got {got.get(first, 'absent')}). Head counts cannot be read off shapes: "
-        "pass config=MintConfig(...)"
+        f"({len(differing)} tensors differ, first {first}: {shapes}). Head counts cannot be read "
+        "off shapes: pass config=MintConfig(...)"
     )
 
 

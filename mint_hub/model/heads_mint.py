@@ -17,6 +17,7 @@ from .layers_mint import MintCrossAttention, MintLayer, MintMLP
 POSE_SIZE = 7
 MAX_ROTATION_STEP = math.radians(30.0)
 INITIAL_FOV_VH_DEG = (60.0, 75.0)
+INITIAL_WRIST_M = (0.0, 0.0, 0.4)  # an arm's length before the camera
 HAND_PARTS = {"translation": (3, 3), "orientation": (6, 3), "pose": (90, 45), "shape": (10, 10)}
 """Parts of a hand's state, in order: numbers when absolute, numbers of an increment."""
 
@@ -77,7 +78,7 @@ class MintCameraHead(nn.Module):
 
 
 class MintFovOutput(nn.Linear):
-    """The last layer of the field-of-view head; a class of its own because it starts differently."""
+    """The last layer of the field-of-view head, a class of its own as it starts differently."""
 
 
 class MintFovHead(nn.Module):

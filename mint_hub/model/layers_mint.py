@@ -41,7 +41,7 @@ def eager_attention(
 def attend(
     module: nn.Module, query: Tensor, key: Tensor, value: Tensor, implementation: str, causal: bool
 ) -> tuple[Tensor, Tensor | None]:
-    """Attention by the named implementation: (B, h, L, d) -> (B, L, h d), weights if it has them."""
+    """Attention by the named implementation: (B, h, L, d) -> (B, L, h d), and weights."""
     interface: Callable[..., tuple[Tensor, Tensor | None]] = ALL_ATTENTION_FUNCTIONS.get_interface(
         implementation, eager_attention
     )
@@ -55,7 +55,8 @@ def rotary_positions(grid_hw: tuple[int, int], num_special: int, head_dim: int, 
     """Cosines and sines, each (P, d), of a frame's tokens: specials at (0, 0), patches from (1, 1).
 
     The head is split in two halves, the first turned by the row, the second by the column; within
-    a half, feature i turns with feature i + d / 4 (2-D RoPE, base 100; Heo et al. 2024, axial form).
+    a half, feature i turns with feature i + d / 4 (2-D RoPE, axial form, base 100; Heo et al.
+    2024).
     """
     rows, columns = grid_hw
     row = torch.arange(1, rows + 1, device=device).repeat_interleave(columns)
@@ -92,7 +93,7 @@ class MintAttention(nn.Module):
         self.out = nn.Linear(width, width)
 
     def forward(self, x: Tensor, implementation: str, rotary: Rotary | None = None):
-        """(B, L, C) -> (B, L, C), and the weights (B, h, L, L) where the implementation has them."""
+        """(B, L, C) -> (B, L, C), and the weights (B, h, L, L) if the implementation has them."""
         qkv = self.qkv(x).unflatten(-1, (3, self.num_heads, -1))  # (B, L, 3C) -> (B, L, 3, h, d)
         query, key, value = qkv.permute(2, 0, 3, 1, 4)  # 3 x (B, h, L, d)
         if self.q_norm is not None:
@@ -189,7 +190,11 @@ class MintEncoderLayer(MintLayer):
     """A layer of the patch encoder: tokens of one frame, no positions inside attention."""
 
 
-class MintFrameLayer(MintLayer):
+class MintAggregatorLayer(MintLayer):
+    """A layer of the aggregator, of either kind: (B, T, P, C) -> (B, T, P, C)."""
+
+
+class MintFrameLayer(MintAggregatorLayer):
     """A layer of the aggregator within each frame: (B, T, P, C) -> (B, T, P, C)."""
 
     def forward(self, x: Tensor, implementation: str, rotary: Rotary | None = None) -> Tensor:
@@ -197,7 +202,7 @@ class MintFrameLayer(MintLayer):
         return super().forward(x.flatten(0, 1), implementation, rotary).view_as(x)
 
 
-class MintGlobalLayer(MintLayer):
+class MintGlobalLayer(MintAggregatorLayer):
     """A layer of the aggregator over all frames of the window: (B, T, P, C) -> (B, T, P, C)."""
 
     def forward(self, x: Tensor, implementation: str, rotary: Rotary | None = None) -> Tensor:

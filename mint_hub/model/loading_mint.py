@@ -1,11 +1,14 @@
-"""Loading weights strictly: what is missing, unexpected, misshapen or broken is listed, not forgiven."""
+"""Loading weights strictly: what is missing, unexpected, misshapen or broken is listed."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from huggingface_hub import is_offline_mode
+from huggingface_hub.errors import StrictDataclassError
 from transformers.utils import cached_file, logging
+from transformers.utils.hub import resolve_revision
 
 from .conversion_mint import config_from_layout, read_layout
 
@@ -32,14 +35,20 @@ def load_checked(
     want_info = kwargs.pop("output_loading_info", False)
     if source is None:
         return load(source, *args, output_loading_info=want_info, **kwargs)
+    revision = _resolve(source, kwargs)
+    if revision is not None:
+        kwargs["revision"] = revision
     if kwargs.get("config") is None and not _has_config(source, kwargs):
-        hub = {k: kwargs[k] for k in ("revision", "token") if kwargs.get(k) is not None}
-        kwargs["config"] = config_from_layout(read_layout(source, **hub), source)
+        kwargs["config"] = config_from_layout(_layout(source, kwargs), source)
     forgive = kwargs.pop("ignore_mismatched_sizes", not strict)
     # Sizes are forgiven while loading so that all faults are listed together, then refused here.
-    model, info = load(
-        source, *args, output_loading_info=True, ignore_mismatched_sizes=True, **kwargs
-    )
+    try:
+        model, info = load(
+            source, *args, output_loading_info=True, ignore_mismatched_sizes=True, **kwargs
+        )
+    except StrictDataclassError as error:
+        raise ValueError(f"{source}: config.json: {error.__cause__ or error}") from error
+    model.config._commit_hash = getattr(revision, "resolved", None)  # for the record of results
     faults = _describe_faults(info, count_mismatched=not forgive)
     if faults and strict:
         raise ValueError(f"{source}: these weights do not fit {cls.__name__}: {faults}")
@@ -61,16 +70,36 @@ def load_checked(
     return (model, info) if want_info else model
 
 
-def _has_config(source: str | Path, kwargs: Mapping[str, Any]) -> bool:
-    keys = ("revision", "token", "cache_dir", "local_files_only", "subfolder", "force_download")
+def _resolve(source: str | Path, kwargs: Mapping[str, Any]) -> str | None:
+    """The commit a repository's revision stands for now, which everything below is read from."""
+    keys = ("token", "local_files_only", "cache_dir")
     options = {k: kwargs[k] for k in keys if kwargs.get(k) is not None}
-    found = cached_file(
-        str(source),
-        "config.json",
-        _raise_exceptions_for_missing_entries=False,
-        **options,
-    )
-    return found is not None
+    return resolve_revision(source, kwargs.get("revision"), **options)
+
+
+def _has_config(source: str | Path, kwargs: Mapping[str, Any]) -> bool:
+    options = _hub_options(kwargs) | {"_raise_exceptions_for_missing_entries": False}
+    return cached_file(str(source), "config.json", **options) is not None
+
+
+def _layout(source: str | Path, kwargs: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of the weights: of a repository from their headers, or from the cache."""
+    if Path(source).is_dir() or not (kwargs.get("local_files_only") or is_offline_mode()):
+        hub = {k: kwargs[k] for k in ("revision", "token") if kwargs.get(k) is not None}
+        return read_layout(source, **hub)
+    options = _hub_options(kwargs) | {"_raise_exceptions_for_missing_entries": False}
+    cached = cached_file(str(source), "model.safetensors", **options)
+    if cached is None:
+        raise OSError(
+            f"{source}: expected in the cache, because the hub may not be asked (HF_HUB_OFFLINE or "
+            "local_files_only); found neither config.json nor model.safetensors there"
+        )
+    return read_layout(Path(cached).parent)
+
+
+def _hub_options(kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    keys = ("revision", "token", "cache_dir", "local_files_only", "subfolder", "force_download")
+    return {k: kwargs[k] for k in keys if kwargs.get(k) is not None}
 
 
 def _describe_faults(info: Mapping[str, Any], count_mismatched: bool) -> str:

@@ -17,7 +17,8 @@ import torch
 from torch import Tensor, nn
 from transformers import initialization as init
 from transformers.modeling_utils import PreTrainedModel
-from transformers.utils import ModelOutput
+from transformers.processing_utils import Unpack
+from transformers.utils import ModelOutput, TransformersKwargs
 from transformers.utils.generic import can_return_tuple, merge_with_config_defaults
 from transformers.utils.output_capturing import OutputRecorder, capture_outputs
 
@@ -25,6 +26,7 @@ from .configuration_mint import MintConfig
 from .conversion_mint import load_lingbot, register_conversion
 from .heads_mint import (
     INITIAL_FOV_VH_DEG,
+    INITIAL_WRIST_M,
     MintCameraHead,
     MintFovHead,
     MintFovOutput,
@@ -32,6 +34,7 @@ from .heads_mint import (
     MintPresenceHead,
 )
 from .layers_mint import (
+    MintAggregatorLayer,
     MintAttention,
     MintEncoderLayer,
     MintFrameLayer,
@@ -40,6 +43,7 @@ from .layers_mint import (
     rotary_positions,
 )
 from .loading_mint import load_checked
+from .saving_mint import SavesCode
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
 IMAGE_STD = (0.229, 0.224, 0.225)
@@ -52,15 +56,15 @@ class MintOutput(ModelOutput):
     Attributes:
         loss: scalar, when labels are given.
         losses: every term of the loss by name, when labels are given.
-        last_hidden_state: (B, T, P, 2C) tokens of the last frame layer and last global layer, joined.
+        last_hidden_state: (B, T, P, 2C) tokens of the last frame and global layers, joined.
         pose_encoding: (B, T, 9) camera state: translation 3, quaternion xyzw 4 (not normalised),
             field of view (vertical, horizontal); world-to-camera, OpenCV axes.
         camera_iterations: translation and quaternion (B, T, 7) after each iteration, last one last.
         hand_state: (B, T, 2, 109) camera-frame hands after the last iteration (see hand_state.py).
         initial_hand_state: (B, T, 2, 109) camera-frame hands of the first iteration.
         presence_logits: (B, T, 2), at or above 0 where a hand is in the picture.
-        hidden_states: (B, T, P, C) before the aggregator's first layer and after each one, frame and
-            global in turn, when asked for.
+        hidden_states: (B, T, P, C) before the aggregator's first layer and after each one, frame
+            and global in turn, when asked for.
         attentions: weights of the same layers, (BT, heads, P, P) of a frame layer and
             (B, heads, TP, TP) of a global one, when asked for with eager attention.
     """
@@ -169,7 +173,7 @@ class MintAggregator(nn.Module):
         return torch.cat([within, x], -1)
 
 
-class MintPreTrainedModel(PreTrainedModel):
+class MintPreTrainedModel(SavesCode, PreTrainedModel):
     """Loading, saving and initialisation shared by MINT models."""
 
     config: MintConfig
@@ -186,7 +190,9 @@ class MintPreTrainedModel(PreTrainedModel):
     _supports_attention_backend = True
     _can_compile_fullgraph = True
     _can_record_outputs = {  # noqa: RUF012
-        "hidden_states": [MintFrameLayer, MintGlobalLayer],
+        "hidden_states": OutputRecorder(
+            MintAggregatorLayer, num_hidden_layers_key="num_recorded_layers"
+        ),
         "attentions": OutputRecorder(MintAttention, index=1, layer_name="aggregator"),
     }
 
@@ -212,7 +218,10 @@ class MintPreTrainedModel(PreTrainedModel):
         )
 
     def save_pretrained(self, save_directory: str | Path, *args: Any, **kwargs: Any) -> None:
-        """Save as `PreTrainedModel.save_pretrained` does, under our tensor names unless asked."""
+        """Save as `PreTrainedModel.save_pretrained` does, under our tensor names unless asked.
+
+        With ``remote_code=True`` the code comes along, see `SavesCode`.
+        """
         kwargs.setdefault("save_original_format", False)
         super().save_pretrained(save_directory, *args, **kwargs)
 
@@ -261,6 +270,7 @@ class MintPreTrainedModel(PreTrainedModel):
             identity = torch.tensor([1.0, 0, 0, 0, 1, 0])
             for name, joints in (("orientation", 1), ("pose", 15)):
                 init.copy_(module.absolute_heads[name].bias, identity.repeat(joints))
+            init.copy_(module.absolute_heads["translation"].bias, torch.tensor(INITIAL_WRIST_M))
             for head in module.increment_heads.values():
                 init.zeros_(head.weight)
                 init.zeros_(head.bias)
@@ -269,7 +279,7 @@ class MintPreTrainedModel(PreTrainedModel):
 
 
 class MintModel(MintPreTrainedModel):
-    """The whole network: patch encoder, aggregator, and the camera, fov, hand and presence heads."""
+    """The whole network: patch encoder, aggregator, camera, fov, hand and presence heads."""
 
     def __init__(self, config: MintConfig):
         super().__init__(config)
@@ -300,6 +310,10 @@ class MintModel(MintPreTrainedModel):
         """The convolution that embeds patches."""
         return self.encoder.patch_embedding
 
+    def set_input_embeddings(self, value: nn.Module) -> None:
+        """Replace the convolution that embeds patches."""
+        self.encoder.patch_embedding = value
+
     def encode_frames(self, pixel_values: Tensor) -> Tensor:
         """Patch tokens of frames, each seen alone: (..., 3, H, W) in [0, 1] -> (..., N, C)."""
         self._check_pixels(pixel_values)
@@ -316,7 +330,7 @@ class MintModel(MintPreTrainedModel):
         patch_tokens: Tensor | None = None,
         grid_hw: tuple[int, int] | None = None,
         labels: None = None,
-        **kwargs,
+        **kwargs: Unpack[TransformersKwargs],
     ) -> MintOutput:
         """Run windows of frames, given as pixels or as patch tokens from `encode_frames`.
 
