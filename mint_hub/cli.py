@@ -1,6 +1,6 @@
 """The command line: parse, call one verb, say what happened.
 
-Exit codes: 0 all done, 1 some video or conversion failed, 2 the call itself is wrong, 130 interrupted.
+Exit codes: 0 all done, 1 some video failed, 2 the call itself is wrong, 130 interrupted.
 """
 
 import argparse
@@ -51,7 +51,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-# --- predict ----------------------------------------------------------------------------------------
+# --- predict --------------------------------------------------------------------------------------
 
 
 def _add_predict(commands: Any) -> None:
@@ -172,7 +172,8 @@ def _runner(args: argparse.Namespace) -> "MintRunner":
     import copy
 
     models = [copy.deepcopy(model) for _ in devices[1:]] + [model]
-    models = [m.eval().to(device) for m, device in zip(models, devices, strict=True)]
+    for copied, device in zip(models, devices, strict=True):
+        torch.nn.Module.to(copied.eval(), device)
     hand_model = HandModel.default(args.mano) if args.mano else None
     return MintRunner(models, MintProcessor.for_config(model.config), hand_model)
 
@@ -209,7 +210,7 @@ def _read_poses(text: str) -> Any:
     return values if isinstance(values, np.ndarray) else {k: values[k] for k in values.files}
 
 
-# --- info -------------------------------------------------------------------------------------------
+# --- info -----------------------------------------------------------------------------------------
 
 
 def _add_info(commands: Any) -> None:
@@ -228,7 +229,7 @@ def _info(args: argparse.Namespace) -> int:
     return 0
 
 
-# --- convert-checkpoint -----------------------------------------------------------------------------
+# --- convert-checkpoint ---------------------------------------------------------------------------
 
 
 def _add_convert(commands: Any) -> None:

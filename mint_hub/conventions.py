@@ -31,7 +31,11 @@ MODEL_FPS: Final = 30.0
 
 JOINT_NAMES: Final = (
     "wrist",
-    *(f"{finger}{i}" for finger in ("index", "middle", "pinky", "ring", "thumb") for i in (1, 2, 3)),
+    *(
+        f"{finger}{i}"
+        for finger in ("index", "middle", "pinky", "ring", "thumb")
+        for i in (1, 2, 3)
+    ),
 )
 """The 16 joints of the hand state, in MANO's order: the wrist, then three a finger, root to tip."""
 
@@ -51,7 +55,7 @@ KEYPOINT_FROM_JOINT: Final = (
 """For each of the 21 keypoints, its number among (16 joints, 5 tips)."""
 
 KEYPOINT_NAMES: Final = tuple((*JOINT_NAMES, *FINGERTIP_NAMES)[j] for j in KEYPOINT_FROM_JOINT)
-"""The 21 keypoints in OpenPose's order: wrist, then thumb, index, middle, ring, pinky, root to tip."""
+"""The 21 keypoints in OpenPose's order: wrist, then thumb to pinky, each from root to tip."""
 
 KEYPOINT_BONES: Final = tuple(
     (0 if i % 4 == 1 else i - 1, i) for i in range(1, len(KEYPOINT_FROM_JOINT))
@@ -59,4 +63,4 @@ KEYPOINT_BONES: Final = tuple(
 """The 20 bones of the drawn skeleton, as (parent, child) keypoint numbers."""
 
 LEFT_MIRROR: Final = (1.0, -1.0, -1.0)
-"""Diagonal of D: a left hand's joint rotations are stored as D R D, as if it were a right hand's."""
+"""Diagonal of D: a left hand's joint rotations are stored as D R D, like a right hand's."""

@@ -16,9 +16,9 @@ def golden_dir() -> Path:
 
 @pytest.fixture(scope="session")
 def real_dir() -> Path:
-    """The folder of real clips, which may not be shipped: $MINT_HUB_REAL, else shared/real beside us."""
+    """The folder of real clips, which may not be shipped: $MINT_HUB_REAL, or beside us."""
     default = TESTS.parent.parent / "shared" / "real"
     folder = Path(os.environ.get("MINT_HUB_REAL", default))
     if not folder.is_dir():
-        pytest.skip(f"the real clips are not at {folder} (set MINT_HUB_REAL); they may not be shipped")
+        pytest.skip(f"no real clips at {folder} (set MINT_HUB_REAL); they may not be shipped")
     return folder

@@ -15,7 +15,7 @@ from typing import Any
 
 from tqdm.auto import tqdm
 
-from mint_hub.inference.runner import MintRunner, RunSettings
+from mint_hub.inference.runner import MintRunner, RunSettings, frame_bar
 from mint_hub.inference.video_input import key_from_name
 from mint_hub.loaders.atomic import replacing
 from mint_hub.loaders.schema import Episode
@@ -135,7 +135,8 @@ def predict_videos(
     say = say or (lambda _: None)
     report = BatchReport()
     folder.mkdir(parents=True, exist_ok=True)
-    bar = tqdm(videos.items(), unit="video", disable=not progress or len(videos) == 1)
+    hidden = None if progress and len(videos) > 1 else True  # None: hidden unless on a terminal
+    bar = tqdm(videos.items(), unit="video", disable=hidden)
     for key, path in bar:
         target = folder / key
         wanted = _fingerprint(path, runner, settings, outputs, options)
@@ -171,14 +172,13 @@ def _write(
     episode.save(target / "episode.npz")
     overlay = None
     if outputs.overlay:
-        with tqdm(total=episode.num_frames, unit="frame", desc="overlay", leave=False,
-                  disable=not progress) as bar:  # fmt: skip
+        with frame_bar(episode.num_frames, "overlay", progress) as bar:
             overlay = write_overlay(
                 episode,
                 video,
                 target / "episode.mp4",
                 hand_model=runner.hand_model,
-                progress=lambda *_: bar.update(),
+                progress=lambda _done, _total: bar.update(),
             )
     if outputs.plots:
         write_trajectory_plot(episode, target / "episode.png")

@@ -57,12 +57,14 @@ class KnownCamera:
         return image if self.rectification is None else self.rectification.apply(image)
 
 
-def correct_translation(hand_state: Float, fov_predicted: Float, fov_true: Float) -> Float:
+def correct_translation(
+    hand_state: NDArray[Any], fov_predicted: Float, fov_true: Float
+) -> NDArray[Any]:
     """Hands (T, 2, 109) moved from under the predicted focal length to under the true one.
 
-    The network sees angles, not pixels: what it calls a depth rests on the field of view it believes
-    in. Keeping the wrist's place in the image and the hand's apparent size, with
-    r = f_true / f_predicted along each axis, z' = z sqrt(r_x r_y) and x' = x (z' / z) / r_x (y alike).
+    The network sees angles, not pixels: what it calls a depth rests on the field of view it
+    believes in. Keeping the wrist's place in the image and the hand's apparent size, with
+    r = f_true / f_predicted along each axis, z' = z sqrt(r_x r_y), x' = x (z' / z) / r_x, y alike.
 
     Args:
         hand_state: (T, 2, 109) camera frame, metres.
@@ -89,8 +91,8 @@ def poses_at(spec: Any, timestamps_s: Float) -> Float:
     """Read `camera_poses=` as T_camera_from_world (T, 4, 4) at the episode's times.
 
     Args:
-        spec: (T, 4, 4), one pose a frame; or a mapping {"timestamps_s": (M,), "T_camera_from_world":
-            (M, 4, 4)} on the video's clock, interpolated on SE(3).
+        spec: (T, 4, 4), one pose a frame; or a mapping with "timestamps_s" (M,) on the video's
+            clock and "T_camera_from_world" (M, 4, 4), interpolated on SE(3).
         timestamps_s: (T,) the episode's.
 
     Raises:

@@ -1,18 +1,20 @@
-"""The transformers task "egocentric-hands": `pipeline("egocentric-hands", model=...)("clip.mp4")`."""
+"""The task "egocentric-hands": `pipeline("egocentric-hands", model=...)("clip.mp4")`."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
-from os import PathLike
+from pathlib import Path
 from typing import Any
 
-from transformers.utils import logging
+import torch
 from transformers.pipelines.base import Pipeline, PipelineRegistry
+from transformers.utils import logging
 
 from mint_hub.inference.runner import MintRunner, RunSettings
 from mint_hub.inference.video_input import is_array_video
 from mint_hub.loaders.schema import Episode
 from mint_hub.model.modeling_mint import MintModel
 from mint_hub.model.processing_mint import MintProcessor
+from mint_hub.model.saving_mint import SavesCode
 
 logger = logging.get_logger(__name__)
 
@@ -30,7 +32,7 @@ _PER_VIDEO = frozenset({"camera", "camera_poses", "key"})
 _PER_CALL = frozenset({"progress", "warnings"})
 
 
-class EgocentricHandsPipeline(Pipeline):
+class EgocentricHandsPipeline(SavesCode, Pipeline):
     """World-space camera and two-hand motion of egocentric videos, as one `Episode` each.
 
     Called with a path, URL, bytes, binary file or frames in memory it returns an `Episode`; with a
@@ -79,8 +81,11 @@ class EgocentricHandsPipeline(Pipeline):
             kwargs["windows_at_once"] = batch_size
         return super().__call__(inputs, *args, **kwargs)
 
-    def save_pretrained(self, save_directory: str | PathLike[str], **kwargs: Any) -> None:
-        """Save model and processor so that `pipeline(TASK, model=save_directory)` loads them."""
+    def save_pretrained(self, save_directory: str | Path, **kwargs: Any) -> None:
+        """Save model and processor so that `pipeline(TASK, model=save_directory)` loads them.
+
+        With ``remote_code=True`` (as in `push_to_hub`) the code comes along, see `SavesCode`.
+        """
         self.model.save_pretrained(save_directory, **kwargs)
         self.processor.save_pretrained(save_directory, **kwargs)
 
@@ -89,7 +94,10 @@ class EgocentricHandsPipeline(Pipeline):
             return [self.model]
         import copy
 
-        return [copy.deepcopy(self.model).to(device).eval() for device in devices]
+        copies = [copy.deepcopy(self.model).eval() for _ in devices]
+        for copied, device in zip(copies, devices, strict=True):
+            torch.nn.Module.to(copied, torch.device(device))
+        return copies
 
     def _sanitize_parameters(self, **parameters: Any) -> tuple[dict[str, Any], ...]:
         if "windows_at_once" in parameters:
@@ -110,14 +118,14 @@ class EgocentricHandsPipeline(Pipeline):
             return {"item": _Item(item)}
         return {"item": _Item({"video": input_})}
 
-    def _forward(self, input_tensors: dict[str, Any], **parameters: Any) -> "_Result":
+    def _forward(self, input_tensors: dict[str, Any], **parameters: Any) -> Any:
         item: dict[str, Any] = input_tensors["item"].values
         options = {k: v for k, v in parameters.items() if k in _PER_VIDEO | _PER_CALL}
         settings = RunSettings(**{k: v for k, v in parameters.items() if k in _SETTINGS})
         options |= {k: v for k, v in item.items() if k != "video"}
         return _Result(self.runner.run(item["video"], settings, **options))
 
-    def postprocess(self, model_outputs: "_Result", **_: Any) -> Episode:
+    def postprocess(self, model_outputs: Any, **_: Any) -> Episode:
         """The episode."""
         return model_outputs.episode
 

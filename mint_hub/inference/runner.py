@@ -10,7 +10,6 @@
 """
 
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
@@ -48,7 +47,7 @@ class RunSettings:
         window: frames in a window; the model's own when None.
         batch_size: windows that go through the network at once.
         presence_threshold: a hand is present where its logit is at least this.
-        smooth: smooth the hands ("+ UKF" in the paper's tables), with these settings or the defaults.
+        smooth: smooth the hands ("+ UKF" in the paper's tables), with settings or the defaults.
         chain_over: align windows over "all" frames they share, or the "first" one, as the public
             release does.
         on_error: what damage in the middle of a video does: "raise", or "stop" and keep what came.
@@ -90,7 +89,7 @@ class MintRunner:
         processor: MintProcessor,
         hand_model: HandModel | None = None,
     ) -> None:
-        self.models = [model] if isinstance(model, MintModel) else list(model)
+        self.models = list(model) if isinstance(model, Sequence) else [model]
         self.processor = processor
         config = self.models[0].config
         self.hand_model = hand_model or (
@@ -146,14 +145,14 @@ class MintRunner:
             )
             times = _Times()
             builder = TrackBuilder(settings.chain_over)
-            with _bar(source, progress) as bar:
+            with frame_bar(source.num_frames, key_from_name(source.name), progress) as bar:
                 for prediction in network.predict(self._pixels(source, known, times, bar)):
                     builder.push(prediction)
             track = builder.finish()
             return self._episode(source, times, track, settings, known, camera_poses, key, warnings)
 
     def _pixels(
-        self, source: VideoInput, known: KnownCamera | None, times: _Times, bar: Any
+        self, source: VideoInput, known: KnownCamera | None, times: _Times, bar: "tqdm[Any]"
     ) -> Iterator[torch.Tensor]:
         """Frames as the network takes them, (3, H, W) in [0, 1]; notes their times on the way."""
         shown: NDArray[np.uint8] | None = None
@@ -166,8 +165,7 @@ class MintRunner:
                 pixels = self.processor.video_processor.preprocess_frames(image[None])[0]
                 shown = frame.image
             yield pixels
-            if bar is not None:
-                bar.update()
+            bar.update()
 
     def _episode(
         self,
@@ -232,7 +230,7 @@ class MintRunner:
             "fps": source.fps,
             "source_timestamps_s": times.source_timestamps_s,
             "conventions": "camera: world-to-camera, OpenCV axes, metres; hands: camera frame",
-            "scale_status": "predicted: metres as the network estimates them, not measured",
+            "scale_status": "predicted",
             "shape_space": config.shape_space,
             "hand_model": self.hand_model.name,
             "warnings": [*warnings, *source.warnings],
@@ -253,8 +251,7 @@ class MintRunner:
         return meta
 
 
-def _bar(source: VideoInput, show: bool) -> AbstractContextManager[Any]:
-    if not show:
-        return nullcontext()
-    name = key_from_name(source.name)
-    return tqdm(total=source.num_frames, unit="frame", desc=name, dynamic_ncols=True, leave=False)
+def frame_bar(total: int | None, name: str, show: bool) -> "tqdm[Any]":
+    """Make a progress bar of frames on standard error, hidden where that is no terminal."""
+    hidden = None if show else True
+    return tqdm(total=total, unit="frame", desc=name, leave=False, disable=hidden)

@@ -1,4 +1,4 @@
-"""One way in for every kind of video: a file or URL that is decoded, or frames already in memory."""
+"""One way in for every kind of video: a file or URL to decode, or frames already in memory."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
