@@ -63,7 +63,8 @@ def _add_predict(commands: Any) -> None:
         "run again.",
     )
     add = parser.add_argument
-    add("videos", nargs="+", help="video files, folders or URLs")
+    add("videos", nargs="*", help="video files, folders or URLs")
+    add("--sample", action="store_true", help="the clip that comes with mint-hub")
     add("-o", "--out", type=Path, required=True, help="folder for the results")
     weights = parser.add_mutually_exclusive_group(required=True)
     weights.add_argument("--model", help="folder or hub repository of a MINT checkpoint")
@@ -96,13 +97,16 @@ def _add_predict(commands: Any) -> None:
 
 
 def _predict(args: argparse.Namespace) -> int:
+    from mint_hub.assets import sample_clip
     from mint_hub.inference.batch import Outputs, failures_text, find_videos, predict_videos
     from mint_hub.inference.runner import RunSettings
     from mint_hub.view.scene import import_rerun
 
     if args.rerun:
         import_rerun()
-    videos = find_videos(args.videos)
+    if not args.videos and not args.sample:
+        raise ValueError("expected a video file, folder or URL, or --sample")
+    videos = find_videos([*args.videos, *([sample_clip()] if args.sample else [])])
     settings = RunSettings(
         fps=None if args.fps == "native" else _number("--fps", args.fps),
         overlap=args.overlap,

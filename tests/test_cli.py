@@ -1,4 +1,4 @@
-"""The command line: what it writes, what it says, and the exit code of everything that goes wrong."""
+"""The command line: what it writes, what it says, and the exit code of all that goes wrong."""
 
 import json
 
@@ -119,7 +119,7 @@ def test_known_camera_and_poses(predict, clips, tmp_path):
     np.testing.assert_array_equal(episode.T_camera_from_world, poses)
 
 
-# --- what goes wrong --------------------------------------------------------------------------------
+# --- what goes wrong ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_known_camera_and_poses(predict, clips, tmp_path):
         (lambda p: p / "absent.mp4", "absent.mp4: "),
         (lambda p: _bytes(p / "text.mp4", b"no video at all"), "not a video"),
         (lambda p: video_files.audio_only(p / "sound.mp4"), "no video stream"),
-        (lambda p: video_files.no_frames(p / "empty.mp4"), "empty.mp4: "),
+        (lambda p: video_files.no_frames(p / "empty.mkv"), "holds no frames"),
         (lambda p: video_files.cut_without_index(p / "head.mp4"), "head.mp4: "),
         (lambda p: video_files.cut_with_index(p / "cut.mp4"), "cut.mp4: "),
     ],
@@ -217,7 +217,7 @@ def test_nothing_asked(capsys):
     assert stop.value.code == 2
 
 
-# --- info and convert-checkpoint --------------------------------------------------------------------
+# --- info and convert-checkpoint ------------------------------------------------------------------
 
 
 def test_info(checkpoint, capsys):
