@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from mint_hub.assets.hand_anatomy import SPLAY_DEG, THUMB_DIRECTIONS, THUMB_PALMAR
+from mint_hub.assets.raster import fill, vertex_normals
 from mint_hub.conventions import JOINT_NAMES, Side
 from mint_hub.geometry.hand_model import HandModel
 from mint_hub.geometry.hand_state import HandState
@@ -127,44 +128,12 @@ def draw(
     depth = np.full((resolution, resolution), np.inf)
     shading = np.zeros((resolution, resolution, 3))
     for face in faces:
-        _fill(pixels[face], normals[face], depth, shading)
+        fill(pixels[face], normals[face], depth, shading)
     image = np.broadcast_to(PAPER, shading.shape).copy()
     seen = np.isfinite(depth)
     image[seen] = _colour(shading[seen])
     small = image.reshape(size, OVERSAMPLING, size, OVERSAMPLING, 3).mean((1, 3))
     return (np.clip(small, 0, 255) / 5).round().astype(np.uint8) * 5  # fewer colours, smaller file
-
-
-def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return unit outward normals (V, 3), faces weighted by area."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    across = np.cross(b - a, c - a)
-    normals = np.zeros_like(vertices)
-    for i in range(3):
-        np.add.at(normals, faces[:, i], across)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-
-
-def _fill(corners: np.ndarray, normals: np.ndarray, depth: np.ndarray, shading: np.ndarray) -> None:
-    low = np.maximum(np.ceil(corners[:, :2].min(0)).astype(int), 0)
-    high = np.minimum(np.floor(corners[:, :2].max(0)).astype(int) + 1, depth.shape[::-1])
-    if (high <= low).any():
-        return
-    (ax, ay), (bx, by), (cx, cy) = corners[:, :2]
-    area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-    if abs(area) < 1e-12:
-        return
-    xs, ys = np.arange(low[0], high[0])[None, :], np.arange(low[1], high[1])[:, None]
-    wb = ((xs - ax) * (cy - ay) - (ys - ay) * (cx - ax)) / area
-    wc = ((bx - ax) * (ys - ay) - (by - ay) * (xs - ax)) / area
-    wa = 1 - wb - wc
-    inside = (wa >= -1e-9) & (wb >= -1e-9) & (wc >= -1e-9)
-    z = wa * corners[0, 2] + wb * corners[1, 2] + wc * corners[2, 2]
-    part = np.s_[low[1] : high[1], low[0] : high[0]]
-    nearer = inside & (z < depth[part])
-    depth[part][nearer] = z[nearer]
-    blend = wa[..., None] * normals[0] + wb[..., None] * normals[1] + wc[..., None] * normals[2]
-    shading[part][nearer] = blend[nearer]
 
 
 def _colour(normals: np.ndarray) -> np.ndarray:
