@@ -27,12 +27,18 @@ def _register_config(module: ModuleType) -> None:
     module.AutoConfig.register(config.model_type, config, exist_ok=True)
 
 
-def _register_class(mapping: str, source: str, name: str) -> Callable[[ModuleType], None]:
-    """Make a hook that enters the class ``name`` for MINT configurations in an auto mapping."""
+def _register_class(
+    mapping: str, source: str, name: str, backend: str | None = None
+) -> Callable[[ModuleType], None]:
+    """Make a hook that enters the class ``name`` for MINT configurations in an auto mapping.
+
+    Mappings of image and video processors hold a class for each ``backend``.
+    """
 
     def hook(module: ModuleType) -> None:
         stand_in: Any = wrapt.LazyObjectProxy(lambda: getattr(import_module(source), name))
-        getattr(module, mapping).register(_config_class(), stand_in, exist_ok=True)
+        entry = stand_in if backend is None else {backend: stand_in}
+        getattr(module, mapping).register(_config_class(), entry, exist_ok=True)
 
     return hook
 
@@ -56,7 +62,10 @@ HOOKS: dict[str, Callable[[ModuleType], None]] = {
         "MODEL_MAPPING", "mint_hub.model.modeling_mint", "MintModel"
     ),
     f"{AUTO}.video_processing_auto": _register_class(
-        "VIDEO_PROCESSOR_MAPPING", _PROCESSING, "MintVideoProcessor"
+        "VIDEO_PROCESSOR_MAPPING",
+        _PROCESSING,
+        "MintVideoProcessor",
+        backend="torchvision",  # the backend that is asked for by default; ours needs none
     ),
     f"{AUTO}.processing_auto": _register_class("PROCESSOR_MAPPING", _PROCESSING, "MintProcessor"),
     "transformers.pipelines": _register_pipeline,

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
-from pathlib import Path
+from os import PathLike
 from typing import Any
 
 import torch
@@ -81,7 +81,7 @@ class EgocentricHandsPipeline(SavesCode, Pipeline):
             kwargs["windows_at_once"] = batch_size
         return super().__call__(inputs, *args, **kwargs)
 
-    def save_pretrained(self, save_directory: str | Path, **kwargs: Any) -> None:
+    def save_pretrained(self, save_directory: str | PathLike[str], **kwargs: Any) -> None:
         """Save model and processor so that `pipeline(TASK, model=save_directory)` loads them.
 
         With ``remote_code=True`` (as in `push_to_hub`) the code comes along, see `SavesCode`.

@@ -10,6 +10,7 @@ attention within a frame and attention over the whole window. Four heads read it
 
 import math
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Any, Self
 
@@ -217,7 +218,9 @@ class MintPreTrainedModel(SavesCode, PreTrainedModel):
             cls, super().from_pretrained, pretrained_model_name_or_path, *args, **kwargs
         )
 
-    def save_pretrained(self, save_directory: str | Path, *args: Any, **kwargs: Any) -> None:
+    def save_pretrained(
+        self, save_directory: str | PathLike[str], *args: Any, **kwargs: Any
+    ) -> None:
         """Save as `PreTrainedModel.save_pretrained` does, under our tensor names unless asked.
 
         With ``remote_code=True`` the code comes along, see `SavesCode`.
