@@ -1,7 +1,7 @@
 """Memory over a long video: resident size after 1 minute and after 10, in one run.
 
 ``python benchmarks/memory.py [CLIP] [--minutes 10] [--model FOLDER]``. The clip (by default the
-embedded one) is looped to the length by copying its packets. Results grow with the video; the growth
+embedded one) is looped to the length by copying its packets. Results grow with the video; growth
 beyond them is what is reported. Writes ``benchmarks/results/memory-<date>.json``.
 """
 

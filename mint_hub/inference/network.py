@@ -1,17 +1,18 @@
 """Frames in, predictions of whole windows out: each frame encoded once, windows in batches.
 
-Work is handed to one worker thread a device, so that decoding and resizing (in the caller's thread)
-go on while the network runs, and several devices share the windows of one video. Nothing grows with
-the length of the video: a few windows of patch tokens are held at a time.
+With accelerators, work is handed to one thread a device, so that decoding and resizing (in the
+caller's thread) go on while the network runs, and several devices share the windows of a video. On
+a single CPU everything runs in the caller's thread: a second one would only compete for the cores.
+Nothing grows with the length of the video: a few windows of patch tokens are held at a time.
 """
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import cycle
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -45,12 +46,25 @@ class WindowPrediction:
     presence_logits: NDArray[np.float32]
 
 
+class _Inline(Executor):
+    """Runs what is submitted at once, in the caller's thread."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> "Future[Any]":
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
 class _Device:
     """One copy of the model and the thread that feeds it."""
 
-    def __init__(self, model: MintModel) -> None:
+    def __init__(self, model: MintModel, alone: bool) -> None:
         self.model = model
-        self.thread = ThreadPoolExecutor(1, thread_name_prefix="mint-device")
+        on_cpu = model.device.type == "cpu"
+        self.thread = _Inline() if alone and on_cpu else ThreadPoolExecutor(1, "mint-device")
 
     @torch.inference_mode()
     def encode(self, pixels: torch.Tensor) -> torch.Tensor:
@@ -125,7 +139,7 @@ class WindowNetwork:
         """
         patch = self.models[0].config.patch_size
         with ExitStack() as stack:
-            devices = [_Device(model) for model in self.models]
+            devices = [_Device(model, alone=len(self.models) == 1) for model in self.models]
             for device in devices:
                 stack.callback(device.thread.shutdown, wait=True, cancel_futures=True)
             turn = cycle(devices)

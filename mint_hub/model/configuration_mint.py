@@ -136,8 +136,8 @@ class MintConfig(PreTrainedConfig):
     def tiny(cls, **overrides: Any) -> Self:
         """Sizes that run in real time on two CPU cores (for the default checkpoint)."""
         sizes: dict[str, Any] = {
-            "image_size": (126, 168),
-            "position_grid": 12,
+            "image_size": (112, 140),
+            "position_grid": 10,
             "hidden_size": 192,
             "num_attention_heads": 3,
             "encoder_layers": 6,

@@ -10,8 +10,8 @@ from transformers import pipeline
 import mint_hub
 from mint_hub.geometry import rigid
 from mint_hub.loaders.schema import Episode
-from tests.small_model import small_model
 from tests import video_files
+from tests.small_model import small_model
 
 FRAMES = 75
 
