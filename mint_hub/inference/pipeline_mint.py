@@ -10,8 +10,8 @@ from transformers.pipelines.base import Pipeline, PipelineRegistry
 from transformers.utils import logging
 
 from mint_hub.inference.runner import MintRunner, RunSettings
-from mint_hub.inference.video_input import is_array_video
 from mint_hub.loaders.schema import Episode
+from mint_hub.model.frames_mint import is_decoded
 from mint_hub.model.modeling_mint import MintModel
 from mint_hub.model.processing_mint import MintProcessor
 from mint_hub.model.saving_mint import SavesCode
@@ -72,7 +72,7 @@ class EgocentricHandsPipeline(SavesCode, Pipeline):
         """See the class."""
         if isinstance(inputs, list) and not inputs:
             return []
-        if is_array_video(inputs):
+        if is_decoded(inputs):
             inputs = {"video": inputs}
         elif _is_table(inputs):
             inputs = (row for row in inputs)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mint_hub.conventions import MODEL_FPS
 from mint_hub.loaders.video import Frame, VideoFrames, VideoSource, iter_frames
+from mint_hub.model.frames_mint import is_decoded, rgb_uint8
 
 OnError = Literal["raise", "stop"]
 ArrayVideo = NDArray[Any] | torch.Tensor | Sequence[Any]
@@ -64,8 +65,8 @@ class VideoInput(AbstractContextManager["VideoInput"]):
             ValueError: frames of the wrong shape or type.
 
         """
-        if is_array_video(video):
-            return cls._from_arrays(as_frames(video), fps or MODEL_FPS)
+        if is_decoded(video):
+            return cls._from_arrays(rgb_uint8(video), fps or MODEL_FPS)
         frames = iter_frames(video, fps, on_error=on_error)  # pyright: ignore[reportArgumentType]
         info = frames.info
         count = info.num_frames
@@ -87,45 +88,6 @@ class VideoInput(AbstractContextManager["VideoInput"]):
         return cls("<frames in memory>", size, fps, len(images), frames)
 
 
-def is_array_video(video: object) -> bool:
-    """Whether this is frames in memory: an array, a tensor, or a list of pictures (H, W, 3)."""
-    if isinstance(video, np.ndarray | torch.Tensor):
-        return True
-    return isinstance(video, list | tuple) and len(video) > 0 and _is_picture(video[0])  # pyright: ignore
-
-
-def as_frames(video: Any) -> NDArray[np.uint8]:
-    """Frames in memory as (T, H, W, 3) uint8 RGB.
-
-    Integers are taken as 0..255, floats as 0..1. Tensors may have the channels second.
-
-    Raises:
-        ValueError: another shape or type, or floats outside 0..1.
-
-    """
-    if isinstance(video, list | tuple):
-        pictures = [np.asarray(picture) for picture in video]  # pyright: ignore
-        if len({picture.shape for picture in pictures}) > 1:
-            shapes = sorted({picture.shape for picture in pictures})
-            raise ValueError(f"video: expected frames of one size, got {shapes}")
-        array = np.stack(pictures)
-    else:
-        array = video.detach().cpu().numpy() if isinstance(video, torch.Tensor) else video
-    if array.ndim == 4 and array.shape[-1] != 3 and array.shape[1] == 3:
-        array = np.moveaxis(array, 1, -1)
-    if array.ndim != 4 or array.shape[-1] != 3 or 0 in array.shape:
-        raise ValueError(
-            f"video: expected frames (T, H, W, 3) with T, H, W > 0, got shape {array.shape}"
-        )
-    if array.dtype == np.uint8:
-        return array
-    if not np.issubdtype(array.dtype, np.floating):
-        raise ValueError(f"video: expected uint8, or floats in 0..1, got {array.dtype}")
-    if not (np.isfinite(array).all() and array.min() >= 0 and array.max() <= 1):
-        raise ValueError(f"video: expected floats in 0..1, got {array.min():g}..{array.max():g}")
-    return np.round(array * 255).astype(np.uint8)
-
-
 def key_from_name(name: str) -> str:
     """An episode key from where a video came from: [a-z0-9_-] only, never empty.
 
@@ -137,9 +99,3 @@ def key_from_name(name: str) -> str:
         c if c.isascii() and (c.isalnum() or c in "_-") else " " for c in stem.lower()
     )
     return "_".join(cleaned.split()) or "video"
-
-
-def _is_picture(item: Any) -> bool:
-    if isinstance(item, np.ndarray | torch.Tensor):
-        return item.ndim == 3
-    return hasattr(item, "getbands") and hasattr(item, "size")  # a Pillow image, if Pillow is there

@@ -13,7 +13,6 @@ is as fast but several levels away, so it is not used.
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from os import PathLike
 from typing import Any, Self
 
 import numpy as np
@@ -21,11 +20,21 @@ import torch
 import torch.nn.functional as F
 from huggingface_hub.dataclasses import validate_typed_dict
 from transformers.feature_extraction_utils import BatchFeature
-from transformers.image_utils import ChannelDimension, SizeDict
+from transformers.image_utils import SizeDict
 from transformers.processing_utils import ProcessorMixin, Unpack, VideosKwargs
 from transformers.video_processing_utils import BaseVideoProcessor
 from transformers.video_utils import VideoMetadata
 
+from .frames_mint import (
+    as_tensor,
+    channels_first,
+    check_unit_range,
+    is_array,
+    is_decoded,
+    is_encoded,
+    is_pillow,
+    to_rgb,
+)
 from .saving_mint import SavesCode
 
 _FILTERS = {0: "nearest-exact", 2: "bilinear", 3: "bicubic"}  # Pillow's numbers
@@ -125,7 +134,7 @@ class MintVideoProcessor(SavesCode, BaseVideoProcessor):
             raise ValueError(
                 f"frames: expected (n, H, W, 3) uint8, got {frames.shape} {frames.dtype}"
             )
-        return self._pixels(_tensor(frames).permute(0, 3, 1, 2), self._options({}))
+        return self._pixels(as_tensor(frames).permute(0, 3, 1, 2), self._options({}))
 
     def _options(self, kwargs: Mapping[str, Any]) -> dict[str, Any]:
         """Check the arguments of a call and fill in the rest from the attributes."""
@@ -146,9 +155,9 @@ class MintVideoProcessor(SavesCode, BaseVideoProcessor):
     def _one(
         self, video: Any, metadata: VideoMetadata | None, options: dict[str, Any]
     ) -> tuple[torch.Tensor, VideoMetadata]:
-        if _is_encoded(video):
+        if is_encoded(video):
             return self._decoded(video, options)
-        frames = _channels_first(video, options["input_data_format"])
+        frames = channels_first(video, options["input_data_format"])
         if metadata is None:
             total, _, height, width = frames.shape
             metadata = VideoMetadata(
@@ -172,7 +181,7 @@ class MintVideoProcessor(SavesCode, BaseVideoProcessor):
                 pixels.append(pixels[-1])
             else:
                 shown = frame.image
-                pixels.append(self._pixels(_tensor(shown)[None].permute(0, 3, 1, 2), options))
+                pixels.append(self._pixels(as_tensor(shown)[None].permute(0, 3, 1, 2), options))
             times.append((frame.source_index, frame.timestamp_s, frame.source_timestamp_s))
         video = torch.cat(pixels)
         metadata = MintVideoMetadata(
@@ -258,7 +267,7 @@ class MintVideoProcessor(SavesCode, BaseVideoProcessor):
         if options["do_convert_rgb"]:
             frames = self.convert_to_rgb(frames)
         if options["do_rescale"] and frames.is_floating_point():
-            _check_unit_range(frames)
+            check_unit_range(frames)
         do_rescale = options["do_rescale"] and not frames.is_floating_point()
         if options["do_resize"]:
             frames = self.resize(frames, options["size"], options["resample"])
@@ -273,14 +282,7 @@ class MintVideoProcessor(SavesCode, BaseVideoProcessor):
 
     def convert_to_rgb(self, video: torch.Tensor, **_: Any) -> torch.Tensor:
         """(n, C, H, W) -> (n, 3, H, W): grey is repeated, transparency is laid over white."""
-        if video.shape[1] == 1:
-            return video.expand(-1, 3, -1, -1)
-        if video.shape[1] == 4:
-            white = 1.0 if video.is_floating_point() else 255.0
-            colour, alpha = video[:, :3].float(), video[:, 3:].float() / white
-            blended = white + (colour - white) * alpha
-            return blended if video.is_floating_point() else blended.round().to(video.dtype)
-        return video
+        return to_rgb(video)
 
     def resize(
         self, image: torch.Tensor, size: SizeDict, resample: Any = None, **_: Any
@@ -362,33 +364,20 @@ def _open(source: Any, fps: float | None) -> Any:
     return iter_frames(source, fps)
 
 
-def _is_encoded(video: Any) -> bool:
-    kinds = str | PathLike | bytes | bytearray | memoryview | Mapping
-    return isinstance(video, kinds) or (hasattr(video, "read") and hasattr(video, "seek"))
-
-
-def _is_pillow(frame: Any) -> bool:
-    return hasattr(frame, "getbands") and hasattr(frame, "convert")
-
-
-def _is_array(value: Any) -> bool:
-    return isinstance(value, np.ndarray | torch.Tensor)
-
-
 def _each_video(videos: Any) -> Iterator[Any]:
     """Flatten whatever nesting into videos."""
-    if _is_encoded(videos):
+    if is_encoded(videos):
         yield videos
-    elif _is_array(videos):
+    elif is_array(videos):
         if videos.ndim not in (3, 4, 5):
             raise ValueError(
                 f"videos: expected 4 dimensions a video, got shape {tuple(videos.shape)}"
             )
         yield from videos if videos.ndim == 5 else [videos if videos.ndim == 4 else videos[None]]
-    elif _is_pillow(videos):
+    elif is_pillow(videos):
         yield [videos]
     elif isinstance(videos, list | tuple):
-        if videos and (_is_pillow(videos[0]) or (_is_array(videos[0]) and videos[0].ndim < 4)):
+        if is_decoded(videos):
             yield videos
         else:
             for video in videos:
@@ -406,64 +395,6 @@ def _each_metadata(given: Any, count: int) -> list[VideoMetadata | None]:
     if len(flat) != count:
         raise ValueError(f"video_metadata: expected one a video ({count}), got {len(flat)}")
     return [one if isinstance(one, VideoMetadata) else VideoMetadata(**one) for one in flat]
-
-
-def _tensor(array: np.ndarray) -> torch.Tensor:
-    """Share a NumPy array's memory where torch can (not with negative strides or read-only)."""
-    usable = array.flags.writeable and min(array.strides, default=0) >= 0
-    return torch.from_numpy(array if usable else array.copy())
-
-
-def _frame(frame: Any, number: int, shape: tuple[int, ...] | None) -> torch.Tensor:
-    if _is_pillow(frame):
-        frame = np.array(frame if frame.mode in ("L", "RGB", "RGBA") else frame.convert("RGB"))
-        frame = frame[..., None] if frame.ndim == 2 else frame
-    frame = _tensor(frame) if isinstance(frame, np.ndarray) else frame
-    if not isinstance(frame, torch.Tensor) or frame.ndim != 3:
-        found = tuple(frame.shape) if isinstance(frame, torch.Tensor) else type(frame).__name__
-        raise ValueError(f"frame {number}: expected (H, W, C) or (C, H, W), got {found}")
-    if shape is not None and frame.shape != shape:
-        raise ValueError(
-            f"frame {number}: expected {tuple(shape)} as before, got {tuple(frame.shape)}"
-        )
-    return frame
-
-
-def _channels_first(video: Any, layout: str | ChannelDimension | None) -> torch.Tensor:
-    """Any decoded video -> (T, C, H, W), uint8 or floating point."""
-    prefer_last = isinstance(video, np.ndarray)
-    if isinstance(video, list | tuple):
-        prefer_last = not isinstance(video[0], torch.Tensor)
-        frames: list[torch.Tensor] = []
-        for number, frame in enumerate(video):
-            frames.append(_frame(frame, number, frames[0].shape if frames else None))
-        video = torch.stack(frames)
-    video = _tensor(video) if isinstance(video, np.ndarray) else video
-    if len(video) == 0:
-        raise ValueError(f"videos: expected at least one frame, got shape {tuple(video.shape)}")
-    first, last = (video.shape[axis] in (1, 3, 4) for axis in (1, 3))
-    if layout is not None:
-        use_last = ChannelDimension(layout) == ChannelDimension.LAST
-    elif first or last:
-        use_last = last and (prefer_last or not first)
-    else:
-        raise ValueError(f"videos: expected (T, H, W, 3) or (T, 3, H, W), got {tuple(video.shape)}")
-    video = video.permute(0, 3, 1, 2) if use_last else video
-    if video.is_floating_point() or video.dtype == torch.uint8:
-        return video
-    low, high = int(video.min()), int(video.max())
-    if video.dtype == torch.bool or low < 0 or high > 255:
-        raise ValueError(f"videos: expected 0..255, got {low}..{high} as {video.dtype}")
-    return video.to(torch.uint8)
-
-
-def _check_unit_range(frames: torch.Tensor) -> None:
-    low, high = float(frames.min()), float(frames.max())
-    if not (low >= -_TIE and high <= 1 + _TIE):  # also refuses nan
-        raise ValueError(
-            f"videos: expected floating point frames in [0, 1], got [{low:g}, {high:g}]; "
-            "give uint8, or do_rescale=False to take them as they are"
-        )
 
 
 def _stack(pixels: list[torch.Tensor]) -> torch.Tensor:
