@@ -180,6 +180,8 @@ def _write(
                 hand_model=runner.hand_model,
                 progress=lambda _done, _total: bar.update(),
             )
+    if outputs.rerun:
+        write_rrd(episode, target / "episode.rrd", video=video, hand_model=runner.hand_model)
     if outputs.plots:
         write_trajectory_plot(episode, target / "episode.png")
         write_summary(
@@ -189,8 +191,6 @@ def _write(
             overlay=overlay,
             hand_model=runner.hand_model,
         )
-    if outputs.rerun:
-        write_rrd(episode, target / "episode.rrd", video=video, hand_model=runner.hand_model)
 
 
 def _fingerprint(

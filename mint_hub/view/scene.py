@@ -69,7 +69,7 @@ def write_rrd(
 def import_rerun() -> ModuleType:
     """Import rerun, or say how to install it."""
     try:
-        import rerun
+        import rerun  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         message = '3-D scenes need rerun-sdk: pip install "mint-hub[viz]"'
         raise MissingExtraError(message, name="rerun") from error
@@ -77,7 +77,7 @@ def import_rerun() -> ModuleType:
 
 
 def _blueprint() -> Any:
-    import rerun.blueprint as rrb
+    import rerun.blueprint as rrb  # pyright: ignore[reportMissingImports]
 
     series = rrb.TimeSeriesView(origin="presence", name="presence")
     right = rrb.Vertical(
