@@ -45,10 +45,13 @@ def open_video(source: VideoSource, closing: ExitStack) -> tuple[str, InputConta
         VideoError: nothing there, a folder, text, not a video, a file object that cannot seek.
 
     """
+    known_name = None
     if isinstance(source, Mapping):
+        known_name = source.get("path")
         source = _undecoded(source)
     if isinstance(source, bytes | bytearray | memoryview):
-        name, file = f"<{len(source)} bytes>", cast("BinaryIO", io.BytesIO(source))
+        name = known_name or f"<{len(source)} bytes>"
+        file = cast("BinaryIO", io.BytesIO(source))
     elif isinstance(source, str) and "://" in source:
         name, file = source, _open_url(source, closing)
     elif isinstance(source, str | PathLike):

@@ -6,6 +6,7 @@ Exit codes: 0 all done, 1 some video failed, 2 the call itself is wrong, 130 int
 import argparse
 import json
 import sys
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("interrupted: run the same command again to go on", file=sys.stderr)
         return 130
-    except (ValueError, OSError, ImportError) as error:
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
         print(f"mint-hub {args.command}: {error}", file=sys.stderr)
         return 2
 
@@ -77,7 +78,7 @@ def _add_predict(commands: Any) -> None:
     add("--device", help="one device, or several with commas: cuda:0,cuda:1 (default: best here)")
     add("--dtype", default="auto", help="auto, float32, bfloat16 or float16")
     add("--fps", default="30", help='rate to resample to, or "native" (default: 30)')
-    add("--overlap", type=int, default=8, help="frames that windows share (default: 8)")
+    add("--overlap", type=int, help="frames that windows share (default: 8)")
     add("--window", type=int, help="frames in a window (default: the model's)")
     add("--batch-size", type=int, default=1, help="windows at once (default: 1)")
     add("--smooth", action="store_true", help="smooth the hands (Kalman filter and smoother)")
@@ -124,7 +125,12 @@ def _predict(args: argparse.Namespace) -> int:
     if args.random_weights:
         options["warnings"] = [RANDOM_WEIGHTS]
         print(f"\n*** {RANDOM_WEIGHTS} ***\n", file=sys.stderr)
+    if args.camera_poses is not None and len(videos) > 1:
+        raise ValueError(f"--camera-poses: expected one video with one path, got {len(videos)}")
+    if args.out.exists() and not args.out.is_dir():
+        raise ValueError(f"-o {args.out}: expected a folder, got a file")
     runner = _runner(args)
+    settings.resolved(runner.models[0].config.window)
     report = predict_videos(
         videos,
         args.out,
@@ -152,6 +158,7 @@ def _runner(args: argparse.Namespace) -> "MintRunner":
     import torch
 
     from mint_hub.geometry.hand_model import HandModel
+    from mint_hub.inference.devices import available_device, available_devices
     from mint_hub.inference.runner import MintRunner
     from mint_hub.model.configuration_mint import MintConfig
     from mint_hub.model.loading_mint import cast_weights
@@ -161,17 +168,16 @@ def _runner(args: argparse.Namespace) -> "MintRunner":
     dtypes = {"auto", "float32", "bfloat16", "float16"}
     if args.dtype not in dtypes:
         raise ValueError(f"--dtype: expected one of {sorted(dtypes)}, got {args.dtype!r}")
-    names = args.device.split(",") if args.device else [_best_device()]
-    try:
-        devices = [torch.device(name) for name in names]
-    except RuntimeError as error:
-        raise ValueError(f"--device: expected e.g. cpu or cuda:0, got {args.device!r}") from error
+    names = args.device.split(",") if args.device else available_devices()[:1]
+    devices = [available_device(name) for name in names]
     if args.random_weights:
         torch.manual_seed(0)
         model = MintModel(MintConfig.tiny(name_or_path="random weights, seed 0"))
         if args.dtype != "auto":
             cast_weights(model, getattr(torch, args.dtype))
     else:
+        if args.model.startswith((".", "/", "~")) and not Path(args.model).expanduser().is_dir():
+            raise ValueError(f"--model: no such folder: {args.model}")
         model = MintModel.from_pretrained(args.model, dtype=args.dtype, revision=args.revision)
     import copy
 
@@ -180,14 +186,6 @@ def _runner(args: argparse.Namespace) -> "MintRunner":
         torch.nn.Module.to(copied.eval(), device)
     hand_model = HandModel.default(args.mano) if args.mano else None
     return MintRunner(models, MintProcessor.for_config(model.config), hand_model)
-
-
-def _best_device() -> str:
-    import torch
-
-    if torch.cuda.is_available():
-        return "cuda"
-    return "mps" if torch.backends.mps.is_available() else "cpu"
 
 
 def _number(name: str, text: str) -> float:
@@ -210,8 +208,14 @@ def _read_camera(text: str) -> Any:
 def _read_poses(text: str) -> Any:
     import numpy as np
 
-    values = np.load(text, allow_pickle=False)
-    return values if isinstance(values, np.ndarray) else {k: values[k] for k in values.files}
+    try:
+        values = np.load(text, allow_pickle=False)
+        return values if isinstance(values, np.ndarray) else {k: values[k] for k in values.files}
+    except (EOFError, ValueError, zipfile.BadZipFile):
+        raise ValueError(
+            f"--camera-poses: {text}: expected a .npy with (T, 4, 4), or a .npz with timestamps_s "
+            "and T_camera_from_world"
+        ) from None
 
 
 # --- info -----------------------------------------------------------------------------------------

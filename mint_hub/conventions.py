@@ -5,7 +5,9 @@ Frames
     frame ``a`` to frame ``b``, so that names chain: ``T_c_from_a = T_c_from_b @ T_b_from_a``.
     The world of a prediction is the camera of its first frame.
 Images
-    Pixel coordinates are (u, v), u right, v down; an image of width W spans 0 <= u < W. A field of
+    Pixel coordinates are (u, v), u right, v down; an image of width W spans 0 <= u < W. Only a
+    calibrated lens and its resampling count integers as pixel centres, as calibrations do: their
+    middle (W - 1) / 2 is the W / 2 of everything else. A field of
     view belongs to a pinhole whose principal point is the image centre (W / 2, H / 2). Sizes are
     (height, width) and say so in their names (``_hw``); fields of view are (vertical, horizontal),
     radians (``_vh_rad``).

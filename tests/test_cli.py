@@ -156,11 +156,9 @@ def test_unusual_videos_work(predict, tmp_path):
     [
         (["--camera", "[[1, 0], [0, 1]]"], "K"),
         (["--camera", "{not json"], "--camera"),
-        (["--overlap", "16"], "overlap"),
-        (["--batch-size", "0"], "batch_size"),
     ],
 )
-def test_settings_that_fail_every_clip(predict, clips, capsys, arguments, message):
+def test_cameras_that_do_not_fit(predict, clips, capsys, arguments, message):
     assert predict(clips / "a.mp4", *arguments) in (1, 2)
     assert message in capsys.readouterr().err
 
@@ -169,8 +167,14 @@ def test_settings_that_fail_every_clip(predict, clips, capsys, arguments, messag
     ("arguments", "message"),
     [
         (["--fps", "fast"], "--fps"),
+        (["--fps", "0"], "fps"),
+        (["--overlap", "16"], "overlap"),
+        (["--batch-size", "0"], "batch_size"),
+        (["--camera-poses", "tests/conftest.py"], "--camera-poses: tests/conftest.py"),
+        (["--camera-poses", "tests/golden/coverage_inputs.npz"], "--camera-poses: expected one"),
         (["--dtype", "int8"], "--dtype"),
-        (["--device", "abacus"], "--device"),
+        (["--device", "abacus"], "device: expected one of"),
+        (["--device", "cuda:7"], "device: expected one of"),
         (["--mano", "no/such/folder"], "MANO_RIGHT.pkl"),
         (["--model", "no/such/folder"], "no/such/folder"),
     ],

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mint_hub.assets import make_sample, sample_render, sample_scene
+import mint_hub.assets
 from mint_hub.conventions import SIDES
 from mint_hub.geometry.camera import project
 from mint_hub.geometry.hand_model import HandModel
@@ -13,8 +13,9 @@ from mint_hub.geometry.rigid import inverse
 from mint_hub.geometry.rotations import geodesic_angle
 from mint_hub.loaders.schema import Episode
 from mint_hub.loaders.video import iter_frames, probe
+from mint_hub.synth import make_sample, sample_render, sample_scene
 
-ASSETS = Path(make_sample.__file__).parent
+ASSETS = Path(mint_hub.assets.__file__).parent
 VIDEO, TRUTH = ASSETS / "sample.mp4", ASSETS / "sample.npz"
 CHECKED = (4, 33, 58, 87)
 

@@ -1,4 +1,4 @@
-"""Data that travels with mint-hub, and the scripts that made it."""
+"""Data that travels with mint-hub; the scripts that made it are in `mint_hub.synth`."""
 
 from importlib import resources
 from pathlib import Path
@@ -12,6 +12,11 @@ def read_asset(name: str) -> bytes:
     return (resources.files(__name__) / name).read_bytes()
 
 
+def asset_path(name: str) -> Path:
+    """Return where a file of this folder lies."""
+    return Path(__file__).with_name(name)
+
+
 def sample_clip() -> Path:
-    """Return the path of the embedded clip: three synthetic seconds, made by `make_sample`."""
-    return Path(__file__).with_name("sample.mp4")
+    """Return the path of the embedded clip: three synthetic seconds with exact truth beside it."""
+    return asset_path("sample.mp4")

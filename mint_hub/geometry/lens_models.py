@@ -176,8 +176,8 @@ class Lens(ABC):
             image_size_hw=size,
             fx=self.fx * sx,
             fy=self.fy * sy,
-            cx=self.cx * sx,
-            cy=self.cy * sy,
+            cx=(self.cx + 0.5) * sx - 0.5,  # integers are pixel centres
+            cy=(self.cy + 0.5) * sy - 0.5,
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -59,7 +59,7 @@ def lens_from(spec: Any, image_size_hw: tuple[int, int]) -> Lens:
         ValueError: malformed input; the message names the field, what was expected and what came.
 
     >>> lens_from({"f": 500, "distortion": [0.1, 0, 0, 0], "model": "opencv"}, (480, 640)).cx
-    320.0
+    319.5
 
     """
     size = require_image_size(image_size_hw)
@@ -110,7 +110,7 @@ def _from_mapping(spec: Mapping[str, Any], images_hw: tuple[int, int]) -> Lens:
     fx, fy = spec.get("fx", spec.get("f")), spec.get("fy", spec.get("f"))
     if fx is None or fy is None or ("f" in spec and ("fx" in spec or "fy" in spec)):
         raise ValueError(f"lens: expected K, or f, or both fx and fy, got keys {sorted(spec)}")
-    center = {"cx": spec.get("cx", size[1] / 2), "cy": spec.get("cy", size[0] / 2)}
+    center = {"cx": spec.get("cx", (size[1] - 1) / 2), "cy": spec.get("cy", (size[0] - 1) / 2)}
     return Lens.from_dict(
         {
             "model": model,

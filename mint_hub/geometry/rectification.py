@@ -69,7 +69,7 @@ def rectification(
         image_size_hw: size of the rectified image; the lens's own when None. It changes how much
             is seen, not the focal length.
         K: (3, 3) intrinsics of the rectified image, used exactly as given. When None, the principal
-            point is the centre (W / 2, H / 2) and the focal lengths are the lens's own, which are
+            point is the middle of the picture and the focal lengths are the lens's own, which are
             those at its optical axis: the middle of the picture keeps its scale.
 
     Raises:
@@ -80,7 +80,8 @@ def rectification(
         lens.image_size_hw if image_size_hw is None else image_size_hw
     )
     if K is None:
-        pinhole = np.array([[lens.fx, 0, width / 2], [0, lens.fy, height / 2], [0, 0, 1.0]])
+        cx, cy = (width - 1) / 2, (height - 1) / 2  # the (W / 2, H / 2) of pixel edges
+        pinhole = np.array([[lens.fx, 0, cx], [0, lens.fy, cy], [0, 0, 1.0]])
     else:
         pinhole = require_intrinsics("K", K)
     uv = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)

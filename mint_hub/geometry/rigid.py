@@ -112,6 +112,35 @@ def interpolate_rigid(T0: ArrayT, T1: ArrayT, alpha: Array | float) -> ArrayT:
     return rigid(R, (1 - fraction) * t0 + fraction * t1)
 
 
+def interpolate_path(times_s: ArrayT, T: ArrayT, at_s: ArrayT) -> ArrayT:
+    """Poses (N, 4, 4) at times (N,) of a path with poses T (M, 4, 4) at times (M,), M >= 1.
+
+    Between two poses as ``interpolate_rigid`` does; before the first and after the last time, the
+    pose there. Give world-from-camera transforms, whose translation is what moves straight.
+
+    Raises:
+        ValueError: wrong shapes, or times that do not increase.
+
+    """
+    require_shape("T", T, (4, 4))
+    xp = namespace(times_s, T, at_s)
+    times: Any = times_s
+    at: Any = at_s
+    poses: Any = T
+    if len(T.shape) != 3 or tuple(times_s.shape) != (len(T),) or len(at_s.shape) != 1 or not len(T):
+        raise ValueError(
+            f"times_s, T, at_s: expected (M,), (M, 4, 4), (N,), got {tuple(times_s.shape)}, "
+            f"{tuple(T.shape)}, {tuple(at_s.shape)}"
+        )
+    if not bool((times[1:] > times[:-1]).all()):
+        raise ValueError("times_s: expected increasing times")
+    after = xp.searchsorted(times, at, side="right").clip(0, len(T) - 1)
+    before = (after - 1).clip(0)
+    span = times[after] - times[before]
+    alpha = (at - times[before]) / xp.where(span > 0, span, xp.ones_like(span))
+    return interpolate_rigid(poses[before], poses[after], alpha.clip(0, 1))
+
+
 def se3_exp(twist: ArrayT) -> ArrayT:
     """Exponential map of twists (..., 6), [v metres, w radians], to transforms (..., 4, 4).
 

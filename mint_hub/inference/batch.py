@@ -8,17 +8,20 @@ settings. Failures are collected and returned.
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from tqdm.auto import tqdm
 
+from mint_hub._version import __version__
 from mint_hub.inference.runner import MintRunner, RunSettings, frame_bar
 from mint_hub.inference.video_input import key_from_name
 from mint_hub.loaders.atomic import replacing
 from mint_hub.loaders.schema import Episode
+from mint_hub.loaders.video import OnError
 from mint_hub.view.overlay import write_overlay
 from mint_hub.view.plots import write_trajectory_plot
 from mint_hub.view.scene import write_rrd
@@ -65,8 +68,9 @@ class BatchReport:
 def find_videos(inputs: Iterable[str | Path]) -> dict[str, str]:
     """Videos by key: files and URLs as given, folders searched for video files, in order.
 
-    Keys come from names (paths below the folder for a folder); two of one name get the start of a
-    hash of their path, so that results never overwrite each other and resume under the same key.
+    Hidden files and the results of earlier runs (videos beside a ``done.json``) are not taken from
+    a folder. Keys come from names (paths below the folder for a folder); where several videos of
+    one call have the same name, each key gets the start of a hash of its path.
 
     Raises:
         ValueError: a folder without videos, or nothing at all.
@@ -78,9 +82,7 @@ def find_videos(inputs: Iterable[str | Path]) -> dict[str, str]:
         if not folder.is_dir():
             named.append((key_from_name(item), item))
             continue
-        files = sorted(
-            p for p in folder.rglob("*") if p.suffix.lower() in VIDEO_SUFFIXES and p.is_file()
-        )
+        files = sorted(p for p in folder.rglob("*") if _is_input(p.relative_to(folder), folder))
         if not files:
             raise ValueError(
                 f"{folder}: expected a folder with videos ({', '.join(sorted(VIDEO_SUFFIXES))}), "
@@ -91,7 +93,8 @@ def find_videos(inputs: Iterable[str | Path]) -> dict[str, str]:
         ]
     if not named:
         raise ValueError("videos: expected at least one file, folder or URL, got none")
-    unique = dict.fromkeys(named)
+    unique = {_same_place(path): (key, path) for key, path in reversed(named)}
+    unique = list(reversed(unique.values()))
     counts: dict[str, int] = {}
     for key, _ in unique:
         counts[key] = counts.get(key, 0) + 1
@@ -99,6 +102,20 @@ def find_videos(inputs: Iterable[str | Path]) -> dict[str, str]:
         key if counts[key] == 1 else f"{key}-{hashlib.sha256(path.encode()).hexdigest()[:8]}": path
         for key, path in unique
     }
+
+
+def _is_input(below: Path, folder: Path) -> bool:
+    path = folder / below
+    return (
+        below.suffix.lower() in VIDEO_SUFFIXES
+        and not any(part.startswith(".") for part in below.parts)
+        and path.is_file()
+        and not (path.parent / DONE).exists()
+    )
+
+
+def _same_place(path: str) -> str:
+    return path if "://" in path else str(Path(path).resolve())
 
 
 def predict_videos(
@@ -146,11 +163,13 @@ def predict_videos(
             continue
         try:
             episode = runner.run(path, settings, key=key, progress=progress, **options)
-            _write(episode, path, target, runner, outputs, progress)
+            _write(episode, path, target, runner, outputs, settings.on_error, progress)
             _mark_done(target, wanted)
-        except (ValueError, OSError, RuntimeError, ImportError) as error:
-            report.failed.append((path, str(error)))
-            say(f"{key}: failed: {error}")
+        except Exception as error:  # whatever one video does, the others go on
+            known = isinstance(error, ValueError | OSError | RuntimeError | ImportError)
+            message = str(error) if known else f"{type(error).__name__}: {error}"
+            report.failed.append((path, message))
+            say(f"{key}: failed: {message}")
             continue
         report.done.append(target)
         say(f"{episode!r} -> {target}")
@@ -165,6 +184,7 @@ def _write(
     target: Path,
     runner: MintRunner,
     outputs: Outputs,
+    on_error: OnError,
     progress: bool,
 ) -> None:
     target.mkdir(parents=True, exist_ok=True)
@@ -179,9 +199,11 @@ def _write(
                 target / "episode.mp4",
                 hand_model=runner.hand_model,
                 progress=lambda _done, _total: bar.update(),
+                on_error=on_error,
             )
     if outputs.rerun:
-        write_rrd(episode, target / "episode.rrd", video=video, hand_model=runner.hand_model)
+        local = video if Path(video).is_file() else None
+        write_rrd(episode, target / "episode.rrd", video=local, hand_model=runner.hand_model)
     if outputs.plots:
         write_trajectory_plot(episode, target / "episode.png")
         write_summary(
@@ -213,11 +235,23 @@ def _fingerprint(
         "revision": getattr(config, "_commit_hash", None),
         "dtype": str(runner.models[0].dtype),
         "hand_model": runner.hand_model.name,
-        "settings": asdict(settings),
+        "mint_hub": __version__,
+        "settings": asdict(settings) | {"batch_size": None},  # how many at once changes nothing
         "outputs": asdict(outputs),
-        "options": {k: repr(v) for k, v in sorted(options.items())},
+        "options": {k: _stamp(v) for k, v in sorted(options.items())},
     }
     return json.loads(json.dumps(wanted))
+
+
+def _stamp(value: Any) -> Any:
+    """A value as JSON; arrays by the hash of their content."""
+    if isinstance(value, Mapping):
+        items: Mapping[Any, Any] = value  # pyright: ignore[reportUnknownVariableType]
+        return {str(k): _stamp(v) for k, v in items.items()}
+    if isinstance(value, np.ndarray):
+        digest = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+        return [list(value.shape), str(value.dtype), digest]
+    return repr(value)
 
 
 def _weights_stamp(model: str) -> list[tuple[str, int, int]]:

@@ -20,6 +20,7 @@ from mint_hub.geometry.rectification import Rectification, rectification
 
 Float = NDArray[np.float64]
 RIGID_TOLERANCE = 1e-3
+MAX_POSE_STEP_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +48,9 @@ class KnownCamera:
         """
         lens = lens_from(spec, image_size_hw)
         height, width = image_size_hw
-        centred = abs(lens.cx - width / 2) < 0.5 and abs(lens.cy - height / 2) < 0.5
+        # A calibration may count from pixel corners or centres: half a pixel either way is centred.
+        off = np.abs([lens.cx - (width - 1) / 2, lens.cy - (height - 1) / 2])
+        centred = bool((off < 1.0).all())
         warp = None if isinstance(lens, PinholeLens) and centred else rectification(lens)
         K = np.array([[lens.fx, 0, width / 2], [0, lens.fy, height / 2], [0, 0, 1.0]])
         return cls(lens, warp, np.asarray(K_to_fov_vh(K, image_size_hw)))
@@ -118,6 +121,11 @@ def poses_at(spec: Any, timestamps_s: Float) -> Float:
             f"got shape {times.shape}"
         )
     slack = float(np.median(np.diff(times)))
+    if slack > MAX_POSE_STEP_S:
+        raise ValueError(
+            f"camera_poses: expected timestamps_s in seconds, at most {MAX_POSE_STEP_S:g} s apart, "
+            f"got steps of {slack:g}"
+        )
     if times[0] > timestamps_s[0] + slack or times[-1] < timestamps_s[-1] - slack:
         raise ValueError(
             f"camera_poses: expected times that cover the video, {timestamps_s[0]:.3f} to "
@@ -133,8 +141,26 @@ def poses_at(spec: Any, timestamps_s: Float) -> Float:
     return np.asarray(rigid.inverse(between))
 
 
+def check_poses(spec: Any) -> None:
+    """Refuse malformed `camera_poses=` before a video is run; times are checked later.
+
+    Raises:
+        ValueError: as `poses_at`.
+
+    """
+    if not isinstance(spec, Mapping):
+        _rigid_poses(spec)
+    elif "T_camera_from_world" in spec:
+        _rigid_poses(spec["T_camera_from_world"])
+
+
 def _rigid_poses(values: Any) -> Float:
-    poses = np.asarray(values, np.float64)
+    try:
+        poses = np.asarray(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"camera_poses: expected numbers (T, 4, 4), got {type(values).__name__}"
+        ) from error
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
         raise ValueError(f"camera_poses: expected (T, 4, 4), got {poses.shape}")
     if not np.isfinite(poses).all():

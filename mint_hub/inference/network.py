@@ -122,7 +122,7 @@ class WindowNetwork:
         if batch_size < 1:
             raise ValueError(f"batch_size: expected at least 1 window, got {batch_size}")
         self.models = models
-        self.length = length or models[0].config.window
+        self.length = models[0].config.window if length is None else length
         self.overlap = overlap
         self.batch_size = batch_size
         WindowPlanner(self.length, overlap)  # complains about sizes at once

@@ -9,7 +9,9 @@ import torch
 from transformers.pipelines.base import Pipeline, PipelineRegistry
 from transformers.utils import logging
 
+from mint_hub.inference.devices import available_device
 from mint_hub.inference.runner import MintRunner, RunSettings
+from mint_hub.inference.video_input import key_from_name
 from mint_hub.loaders.schema import Episode
 from mint_hub.model.frames_mint import is_decoded
 from mint_hub.model.modeling_mint import MintModel
@@ -75,7 +77,7 @@ class EgocentricHandsPipeline(SavesCode, Pipeline):
         if is_decoded(inputs):
             inputs = {"video": inputs}
         elif _is_table(inputs):
-            inputs = (row for row in inputs)
+            inputs = (_from_row(row) for row in inputs)
         batch_size = kwargs.pop("batch_size", None)
         if batch_size is not None:
             kwargs["windows_at_once"] = batch_size
@@ -94,9 +96,10 @@ class EgocentricHandsPipeline(SavesCode, Pipeline):
             return [self.model]
         import copy
 
-        copies = [copy.deepcopy(self.model).eval() for _ in devices]
-        for copied, device in zip(copies, devices, strict=True):
-            torch.nn.Module.to(copied, torch.device(device))
+        places = [available_device(name) for name in devices]
+        copies = [copy.deepcopy(self.model).eval() for _ in places]
+        for copied, device in zip(copies, places, strict=True):
+            torch.nn.Module.to(copied, device)
         return copies
 
     def _sanitize_parameters(self, **parameters: Any) -> tuple[dict[str, Any], ...]:
@@ -111,12 +114,16 @@ class EgocentricHandsPipeline(SavesCode, Pipeline):
 
     def preprocess(self, input_: Any, **_: Any) -> dict[str, Any]:
         """An item to a mapping with "video"; decoding happens while the network runs."""
-        if isinstance(input_, Mapping) and "video" in input_:
+        item: dict[str, Any] = {"video": input_}
+        if isinstance(input_, Mapping) and not input_.keys() <= {"path", "bytes"}:
             item = dict(input_)  # pyright: ignore[reportUnknownArgumentType]
-            if unknown := sorted(item.keys() - _PER_VIDEO - {"video"}):
-                item = {k: v for k, v in item.items() if k not in unknown}
-            return {"item": _Item(item)}
-        return {"item": _Item({"video": input_})}
+            expected = _PER_VIDEO | {"video"}
+            if "video" not in item or not item.keys() <= expected:
+                raise ValueError(
+                    f"{TASK}: expected a mapping with 'video' and at most {sorted(_PER_VIDEO)}, "
+                    f"got {sorted(item)}"
+                )
+        return {"item": _Item(item)}
 
     def _forward(self, input_tensors: dict[str, Any], **parameters: Any) -> Any:
         item: dict[str, Any] = input_tensors["item"].values
@@ -128,6 +135,23 @@ class EgocentricHandsPipeline(SavesCode, Pipeline):
     def postprocess(self, model_outputs: Any, **_: Any) -> Episode:
         """The episode."""
         return model_outputs.episode
+
+
+def _from_row(row: Mapping[str, Any]) -> dict[str, Any]:
+    """The video of a dataset's row, its key, and a camera if the row has a usable one."""
+    names = [name for name in ("video", "mp4") if name in row]
+    if not names:
+        raise ValueError(
+            f"{TASK}: expected a dataset with a column 'video' or 'mp4', got {sorted(row)}"
+        )
+    item: dict[str, Any] = {"video": row[names[0]]}
+    key = row.get("key", row.get("__key__"))
+    if isinstance(key, str):
+        item["key"] = key_from_name(key)
+    camera = row.get("camera")
+    if camera is not None and not isinstance(camera, str):
+        item["camera"] = camera
+    return item
 
 
 class _Item:

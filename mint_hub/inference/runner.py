@@ -9,6 +9,7 @@
 5. presence decided, hands smoothed if asked for, and everything written down in the episode.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
@@ -24,11 +25,17 @@ from mint_hub.geometry import hand_state as hands
 from mint_hub.geometry import rigid
 from mint_hub.geometry.hand_model import HandModel
 from mint_hub.geometry.smoothing import SmoothingSettings, smooth_hands
-from mint_hub.inference.known_camera import KnownCamera, correct_translation, poses_at
+from mint_hub.inference.known_camera import (
+    KnownCamera,
+    check_poses,
+    correct_translation,
+    poses_at,
+)
 from mint_hub.inference.network import WindowNetwork
 from mint_hub.inference.track import Track, TrackBuilder
-from mint_hub.inference.video_input import OnError, Video, VideoInput, key_from_name
+from mint_hub.inference.video_input import Video, VideoInput, key_from_name
 from mint_hub.loaders.schema import Episode
+from mint_hub.loaders.video import OnError
 from mint_hub.model.modeling_mint import MintModel
 from mint_hub.model.processing_mint import MintProcessor
 from mint_hub.windows import WINDOW_OVERLAP
@@ -43,7 +50,7 @@ class RunSettings:
     Attributes:
         fps: frames a second the video is resampled to, or None for its own timing. The network was
             trained at 30.
-        overlap: frames that consecutive windows share.
+        overlap: frames that consecutive windows share; a quarter of a window, at most 8, when None.
         window: frames in a window; the model's own when None.
         batch_size: windows that go through the network at once.
         presence_threshold: a hand is present where its logit is at least this.
@@ -55,13 +62,53 @@ class RunSettings:
     """
 
     fps: float | None = MODEL_FPS
-    overlap: int = WINDOW_OVERLAP
+    overlap: int | None = None
     window: int | None = None
     batch_size: int = 1
     presence_threshold: float = 0.0
     smooth: bool | SmoothingSettings = False
     chain_over: Literal["all", "first"] = "all"
     on_error: OnError = "raise"
+
+    def __post_init__(self) -> None:
+        if self.fps is not None and not (_is_number(self.fps) and 0 < self.fps < math.inf):
+            raise ValueError(f"fps: expected a positive number or None, got {self.fps!r}")
+        for name, least in (("overlap", 1), ("window", 2), ("batch_size", 1)):
+            value = getattr(self, name)
+            if value is None and name != "batch_size":
+                continue
+            if not isinstance(value, int) or isinstance(value, bool) or value < least:
+                raise ValueError(f"{name}: expected a whole number from {least}, got {value!r}")
+        if not _is_number(self.presence_threshold) or math.isnan(self.presence_threshold):
+            raise ValueError(
+                f"presence_threshold: expected a number, got {self.presence_threshold!r}"
+            )
+        if not isinstance(self.smooth, bool | SmoothingSettings):  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise ValueError(f"smooth: expected True, False or settings, got {self.smooth!r}")
+        for name, values in (("chain_over", ("all", "first")), ("on_error", ("raise", "stop"))):
+            if getattr(self, name) not in values:
+                raise ValueError(f"{name}: expected one of {values}, got {getattr(self, name)!r}")
+
+    def resolved(self, model_window: int) -> "RunSettings":
+        """The same with window and overlap as numbers, for a model of this window.
+
+        Raises:
+            ValueError: an overlap that is no shorter than the window.
+
+        """
+        window = model_window if self.window is None else self.window
+        overlap = self.overlap
+        if overlap is None:
+            overlap = max(1, min(WINDOW_OVERLAP, window // 4))
+        if overlap >= window:
+            raise ValueError(
+                f"overlap: expected fewer frames than the window's {window}, got {overlap}"
+            )
+        return replace(self, window=window, overlap=overlap)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 @dataclass
@@ -135,14 +182,16 @@ class MintRunner:
             ValueError: settings or known cameras that do not fit, or a network that diverges.
 
         """
-        settings = settings or RunSettings()
+        settings = (settings or RunSettings()).resolved(self.models[0].config.window)
+        if camera_poses is not None:
+            check_poses(camera_poses)
+        network = WindowNetwork(
+            self.models, settings.window, settings.overlap or 1, settings.batch_size
+        )
         with VideoInput.open(video, settings.fps, settings.on_error) as source:
             known = None
             if camera is not None:
                 known = KnownCamera.from_user(camera, source.image_size_hw)
-            network = WindowNetwork(
-                self.models, settings.window, settings.overlap, settings.batch_size
-            )
             times = _Times()
             builder = TrackBuilder(settings.chain_over)
             with frame_bar(source.num_frames, key_from_name(source.name), progress) as bar:
@@ -210,6 +259,12 @@ class MintRunner:
             meta=self._meta(source, times, track, settings, known, corrections, warnings),
         )
 
+    @staticmethod
+    def _scale_status(corrections: list[str]) -> str:
+        """Whose metres these are: the network's unless the camera's poses were given."""
+        given = any("given poses" in correction for correction in corrections)
+        return "camera given, hands predicted" if given else "predicted"
+
     def _meta(
         self,
         source: VideoInput,
@@ -230,7 +285,7 @@ class MintRunner:
             "fps": source.fps,
             "source_timestamps_s": times.source_timestamps_s,
             "conventions": "camera: world-to-camera, OpenCV axes, metres; hands: camera frame",
-            "scale_status": "predicted",
+            "scale_status": self._scale_status(corrections),
             "shape_space": config.shape_space,
             "hand_model": self.hand_model.name,
             "warnings": [*warnings, *source.warnings],

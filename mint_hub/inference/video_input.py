@@ -5,17 +5,16 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from mint_hub.conventions import MODEL_FPS
-from mint_hub.loaders.video import Frame, VideoFrames, VideoSource, iter_frames
+from mint_hub.loaders.video import Frame, OnError, VideoFrames, VideoSource, iter_frames
 from mint_hub.model.frames_mint import is_decoded, rgb_uint8
 
-OnError = Literal["raise", "stop"]
 ArrayVideo = NDArray[Any] | torch.Tensor | Sequence[Any]
 Video = VideoSource | ArrayVideo
 """A path, URL, bytes or binary file; or frames: (T, H, W, 3), a (T, 3, H, W) tensor, or a list."""
@@ -66,7 +65,7 @@ class VideoInput(AbstractContextManager["VideoInput"]):
 
         """
         if is_decoded(video):
-            return cls._from_arrays(rgb_uint8(video), fps or MODEL_FPS)
+            return cls._from_arrays(rgb_uint8(video), MODEL_FPS if fps is None else fps)
         frames = iter_frames(video, fps, on_error=on_error)  # pyright: ignore[reportArgumentType]
         info = frames.info
         count = info.num_frames

@@ -1,5 +1,6 @@
 """The sizes of a MINT network, validated by name when they are made."""
 
+from dataclasses import fields
 from typing import Any, Literal, Self
 
 from huggingface_hub.dataclasses import strict
@@ -80,6 +81,10 @@ class MintConfig(PreTrainedConfig):
 
     def validate_architecture(self) -> None:
         """Check that sizes fit each other (called by transformers when a configuration is made)."""
+        for name, value in self.to_dict().items():
+            least = 0 if name == "num_register_tokens" else 1
+            if name in self._counts() and value < least:
+                raise ValueError(f"{name}: expected at least {least}, got {value}")
         if len(self.image_size) != 2:
             raise ValueError(f"image_size: expected (height, width), got {self.image_size}")
         for name in ("height", "width"):
@@ -107,9 +112,13 @@ class MintConfig(PreTrainedConfig):
                 f"camera_heads: expected a divisor of 2 * hidden_size={2 * self.hidden_size}, "
                 f"got {self.camera_heads}"
             )
-        for name in ("camera_iterations", "hand_iterations", "aggregator_layers", "window"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
+
+    @classmethod
+    def _counts(cls) -> set[str]:
+        """Names of the fields that are whole numbers."""
+        return {f.name for f in fields(MintConfig) if f.type in (int, "int")} & set(
+            MintConfig.__annotations__
+        )
 
     @property
     def grid_hw(self) -> tuple[int, int]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 from huggingface_hub import get_safetensors_metadata
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from torch import Tensor
 from transformers.conversion_mapping import register_checkpoint_conversion_mapping
 from transformers.core_model_loading import WeightRenaming
@@ -98,7 +98,13 @@ def read_layout(source: str | Path, **hub: Any) -> dict[str, tuple[int, ...]]:
     """
     folder = Path(source)
     if not folder.is_dir():
-        metadata = get_safetensors_metadata(str(source), **hub)
+        try:
+            metadata = get_safetensors_metadata(str(source), **hub)
+        except Exception as error:
+            raise OSError(
+                f"{source}: no such folder, and no weights could be read from a hub repository of "
+                f"that name: {type(error).__name__}: {error}"
+            ) from error
         return {
             key: tuple(info.shape)
             for file in metadata.files_metadata.values()
@@ -111,7 +117,11 @@ def read_layout(source: str | Path, **hub: Any) -> dict[str, tuple[int, ...]]:
         )
     layout: dict[str, tuple[int, ...]] = {}
     for file in files:
-        with safe_open(file, "pt") as handle:
+        try:
+            handle = safe_open(file, "pt")
+        except SafetensorError as error:
+            raise ValueError(f"{file}: damaged or cut short: {error}") from error
+        with handle:
             layout |= {k: tuple(handle.get_slice(k).get_shape()) for k in handle.keys()}  # noqa: SIM118
     return layout
 

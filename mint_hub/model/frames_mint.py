@@ -72,6 +72,8 @@ def channels_first(video: Any, layout: str | ChannelDimension | None) -> torch.T
             frames.append(_frame(frame, number, frames[0].shape if frames else None))
         video = torch.stack(frames)
     video = as_tensor(video) if isinstance(video, np.ndarray) else video
+    if video.ndim != 4:
+        raise ValueError(f"videos: expected (T, H, W, C) or (T, C, H, W), got {tuple(video.shape)}")
     if len(video) == 0:
         raise ValueError(f"videos: expected at least one frame, got shape {tuple(video.shape)}")
     first, last = (video.shape[axis] in (1, 3, 4) for axis in (1, 3))
@@ -84,6 +86,7 @@ def channels_first(video: Any, layout: str | ChannelDimension | None) -> torch.T
     video = video.permute(0, 3, 1, 2) if use_last else video
     if video.is_floating_point() or video.dtype == torch.uint8:
         return video
+    video = video.to(torch.int64)
     low, high = int(video.min()), int(video.max())
     if video.dtype == torch.bool or low < 0 or high > 255:
         raise ValueError(f"videos: expected 0..255, got {low}..{high} as {video.dtype}")

@@ -1,5 +1,7 @@
 """Loading weights strictly: what is missing, unexpected, misshapen or broken is listed."""
 
+import json
+import logging as python_logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -7,9 +9,11 @@ from typing import Any
 import torch
 from huggingface_hub import is_offline_mode
 from huggingface_hub.errors import StrictDataclassError
+from safetensors import SafetensorError
 from transformers.utils import cached_file, logging
 from transformers.utils.hub import resolve_revision
 
+from .configuration_mint import MintConfig
 from .conversion_mint import config_from_layout, read_layout
 
 logger = logging.get_logger(__name__)
@@ -42,12 +46,20 @@ def load_checked(
         kwargs["config"] = config_from_layout(_layout(source, kwargs), source)
     forgive = kwargs.pop("ignore_mismatched_sizes", not strict)
     # Sizes are forgiven while loading so that all faults are listed together, then refused here.
+    report = python_logging.getLogger("transformers.modeling_utils")
+    level = report.level
+    if strict:
+        report.setLevel(python_logging.ERROR)  # our own refusal says it
     try:
         model, info = load(
             source, *args, output_loading_info=True, ignore_mismatched_sizes=True, **kwargs
         )
     except StrictDataclassError as error:
         raise ValueError(f"{source}: config.json: {error.__cause__ or error}") from error
+    except SafetensorError as error:
+        raise ValueError(f"{source}: model.safetensors is damaged or cut short: {error}") from error
+    finally:
+        report.setLevel(level)
     model.config._commit_hash = getattr(revision, "resolved", None)  # for the record of results
     faults = _describe_faults(info, count_mismatched=not forgive)
     if faults and strict:
@@ -78,8 +90,16 @@ def _resolve(source: str | Path, kwargs: Mapping[str, Any]) -> str | None:
 
 
 def _has_config(source: str | Path, kwargs: Mapping[str, Any]) -> bool:
+    """Whether there is a configuration of ours; another project's says nothing about our sizes."""
     options = _hub_options(kwargs) | {"_raise_exceptions_for_missing_entries": False}
-    return cached_file(str(source), "config.json", **options) is not None
+    found = cached_file(str(source), "config.json", **options)
+    if found is None:
+        return False
+    try:
+        values = json.loads(Path(found).read_text())
+    except ValueError as error:
+        raise ValueError(f"{source}: config.json is not JSON: {error}") from error
+    return isinstance(values, dict) and values.get("model_type") == MintConfig.model_type
 
 
 def _layout(source: str | Path, kwargs: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:

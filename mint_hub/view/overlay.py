@@ -22,7 +22,7 @@ from mint_hub.geometry.lenses import lens_from
 from mint_hub.geometry.rectification import Rectification, rectification
 from mint_hub.loaders.atomic import replacing
 from mint_hub.loaders.schema import Episode
-from mint_hub.loaders.video import VideoSource, iter_frames
+from mint_hub.loaders.video import OnError, VideoSource, iter_frames
 from mint_hub.view import canvas
 from mint_hub.view.canvas import MUTED, SIDE_COLORS, WHITE, Color, Image
 
@@ -90,11 +90,12 @@ def overlay_frames(
     hand_model: HandModel | None = None,
     mesh: bool = False,
     only: set[int] | None = None,
+    on_error: OnError = "raise",
 ) -> Iterator[tuple[int, Image]]:
     """Yield (frame index, drawn frame) for the frames of ``episode`` that ``video`` has, in order.
 
     Frames are matched by presentation time, so windows of an episode find theirs. A lens in
-    ``episode.meta["lens"]`` is undone first, onto ``meta["rectified_K"]`` when that is given.
+    ``episode.meta["lens"]`` is undone first.
 
     Args:
         episode: what was seen.
@@ -102,6 +103,7 @@ def overlay_frames(
         hand_model: as in ``Episode.joints_camera``.
         mesh: draw the surface as well.
         only: draw and yield these frames only.
+        on_error: as in `iter_frames`.
 
     Raises:
         VideoError: the video cannot be read.
@@ -117,7 +119,7 @@ def overlay_frames(
     rate = episode.fps if uniform else None
     start, stop = float(t[min(wanted)]), float(t[max(wanted)]) + half
     undo: Rectification | None = None
-    with iter_frames(video, fps=rate, start_s=start, stop_s=stop) as frames:
+    with iter_frames(video, fps=rate, start_s=start, stop_s=stop, on_error=on_error) as frames:
         for frame in frames:
             k = int(np.abs(t - frame.timestamp_s).argmin())
             if k not in wanted or abs(t[k] - frame.timestamp_s) > half:
@@ -137,6 +139,7 @@ def write_overlay(
     hand_model: HandModel | None = None,
     mesh: bool = False,
     progress: Progress | None = None,
+    on_error: OnError = "raise",
 ) -> Path:
     """Write an mp4 (H.264, else MPEG-4) of the video with hands drawn on it; return its path.
 
@@ -150,6 +153,7 @@ def write_overlay(
         hand_model: as in ``Episode.joints_camera``.
         mesh: draw the surface as well.
         progress: called with (frames done, frames in all) after every frame.
+        on_error: what damage in the video does, as in `iter_frames`.
 
     Raises:
         VideoError: the video cannot be read.
@@ -163,7 +167,7 @@ def write_overlay(
     done = 0
     with replacing(path) as temporary, av.open(temporary, "w", format="mp4") as container:
         stream: Any = None
-        for k, image in overlay_frames(episode, video, hand_model, mesh):
+        for k, image in overlay_frames(episode, video, hand_model, mesh, on_error=on_error):
             stream = stream or _add_stream(container, image, episode.fps)
             frame = av.VideoFrame.from_ndarray(image[: stream.height, : stream.width], "rgb24")
             elapsed = float(episode.timestamps_s[k] - episode.timestamps_s[0])
@@ -325,4 +329,4 @@ def _add_stream(container: Any, image: Image, fps: float) -> Any:
 def _rectification(episode: Episode, image: Image) -> Rectification:
     height, width = image.shape[:2]
     lens = lens_from(episode.meta["lens"], (height, width))
-    return rectification(lens, K=episode.meta.get("rectified_K"))
+    return rectification(lens)

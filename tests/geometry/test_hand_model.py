@@ -12,9 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from mint_hub.assets import hand_anatomy
-from mint_hub.assets.hand_surface import is_closed
-from mint_hub.assets.make_hand import NUM_VERTICES, make_hand
 from mint_hub.conventions import JOINT_PARENTS, KEYPOINT_FROM_JOINT, SIDES
 from mint_hub.geometry.hand_asset import (
     HandAsset,
@@ -26,6 +23,9 @@ from mint_hub.geometry.hand_asset import (
 from mint_hub.geometry.hand_model import HandModel, chain
 from mint_hub.geometry.hand_state import HandState, absent, unpack
 from mint_hub.geometry.rotations import rotvec_to_matrix
+from mint_hub.synth import hand_anatomy
+from mint_hub.synth.hand_surface import is_closed
+from mint_hub.synth.make_hand import NUM_VERTICES, make_hand
 
 MODEL = HandModel.template()
 MIRROR = np.array([-1.0, 1.0, 1.0])

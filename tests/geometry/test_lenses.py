@@ -208,7 +208,7 @@ def test_real_aria_calibrations_invert_over_their_images(real_dir: Path) -> None
 
 def test_rectifying_a_centred_pinhole_changes_nothing() -> None:
     image = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
-    made = rectification(PinholeLens((40, 60), 50, 55, 30, 20))
+    made = rectification(PinholeLens((40, 60), 50, 55, 29.5, 19.5))
     np.testing.assert_array_equal(made.apply(image), image)
     np.testing.assert_array_equal(made.apply(image[..., 0]), image[..., 0])
     assert made.valid.all()
@@ -219,7 +219,7 @@ def test_rectifying_a_centred_pinhole_changes_nothing() -> None:
 def test_rectification_equals_opencvs_maps(numbers: tuple[float, ...]) -> None:
     lens = OpenCVLens(SIZE, *CENTRAL, numbers)
     made = rectification(lens)
-    np.testing.assert_array_equal(made.K, [[500, 0, 320], [0, 510, 240], [0, 0, 1]])
+    np.testing.assert_array_equal(made.K, [[500, 0, 319.5], [0, 510, 239.5], [0, 0, 1]])
     expected = cv2.initUndistortRectifyMap(
         lens.K, np.array(numbers), np.eye(3), made.K, SIZE[::-1], cv2.CV_32FC1
     )
@@ -244,9 +244,9 @@ def test_rectified_pixels_show_what_their_ray_shows(lens: Lens) -> None:
 
 
 def test_rectification_marks_what_was_not_seen() -> None:
-    lens = PinholeLens((40, 60), 50, 50, 30, 20)
+    lens = PinholeLens((40, 60), 50, 50, 29.5, 19.5)
     wide = rectification(lens, (80, 120))
-    np.testing.assert_array_equal(wide.K, [[50, 0, 60], [0, 50, 40], [0, 0, 1]])
+    np.testing.assert_array_equal(wide.K, [[50, 0, 59.5], [0, 50, 39.5], [0, 0, 1]])
     white = wide.apply(np.full((40, 60), 255, np.uint8))
     assert wide.valid.sum() == 40 * 60
     assert (white[wide.valid] == 255).all()
@@ -277,7 +277,7 @@ def test_lens_from_accepts_the_usual_forms() -> None:
     K = pinhole.K
     for spec in (K, K.tolist(), torch.as_tensor(K), {"K": K}, pinhole):
         assert lens_from(spec, SIZE) == pinhole
-    assert lens_from({"f": 400}, SIZE) == PinholeLens(SIZE, 400, 400, 320, 240)
+    assert lens_from({"f": 400}, SIZE) == PinholeLens(SIZE, 400, 400, 319.5, 239.5)
     distorted = {"model": "opencv", "K": K, "distortion": np.array(OPENCV[0])}
     assert lens_from(distorted, SIZE) == LENSES[1]
     assert lens_from({"params": ARIA_LIKE}, (1408, 1408)) == LENSES[5]
@@ -287,10 +287,11 @@ def test_lens_from_accepts_the_usual_forms() -> None:
 
 def test_a_calibration_at_another_size_is_carried_over() -> None:
     half = lens_from(LENSES[0], (240, 320))
-    assert half == PinholeLens((240, 320), 250, 255, 161, 118)
+    assert half == PinholeLens((240, 320), 250, 255, 160.75, 117.75)
     points = rays_within(0.4)
     full, small = LENSES[3], LENSES[3].resized((240, 320))
-    np.testing.assert_allclose(small.project(points), full.project(points) / 2, atol=1e-10)
+    halved = (full.project(points) + 0.5) / 2 - 0.5  # integers are pixel centres
+    np.testing.assert_allclose(small.project(points), halved, atol=1e-10)
     with pytest.raises(ValueError, match="aspect ratio"):
         lens_from({"f": 400, "image_size_hw": [1080, 1440]}, (368, 480))
 

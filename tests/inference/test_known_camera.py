@@ -67,6 +67,14 @@ def test_centred_pinhole_needs_no_resampling():
     np.testing.assert_allclose(known.fov_vh_rad, 2 * np.arctan([240 / 500, 320 / 500]))
 
 
+@pytest.mark.parametrize("offset", [0, -0.5])
+def test_the_middle_may_be_counted_from_corners_or_centres(offset):
+    K = [[500, 0, 320 + offset], [0, 500, 240 + offset], [0, 0, 1]]
+    assert KnownCamera.from_user(K, SIZE).rectification is None
+    K[0][2] += 3
+    assert KnownCamera.from_user(K, SIZE).rectification is not None
+
+
 def test_distorted_lens_is_rectified():
     spec = {"model": "opencv", "f": 400, "distortion": [-0.3, 0.1, 0, 0]}
     known = KnownCamera.from_user(spec, SIZE)
@@ -118,6 +126,11 @@ def test_poses_by_time_are_interpolated_where_the_camera_is():
             {"timestamps_s": [5, 6], "T_camera_from_world": np.tile(np.eye(4), (2, 1, 1))},
             "cover the video",
         ),
+        (
+            {"timestamps_s": [0, 1e9], "T_camera_from_world": np.tile(np.eye(4), (2, 1, 1))},
+            "in seconds",
+        ),
+        ("poses.npy", "expected numbers"),
     ],
 )
 def test_malformed_poses_are_refused(spec, message):

@@ -167,6 +167,30 @@ def test_without_a_model_the_message_says_what_to_pass():
         pipeline("egocentric-hands")
 
 
+def test_rows_of_a_dataset(pipe, clip, episode):
+    """A column named as in the corpus, undecoded cells, and columns that mean something else."""
+    import datasets
+
+    cell = {"path": str(clip), "bytes": clip.read_bytes()}
+    rows = {"mp4": [cell], "camera": ["aria"], "__key__": ["Clip 01.mp4"], "label": [3]}
+    (result,) = list(pipe(datasets.Dataset.from_dict(rows)))
+    assert same(result, episode)
+    assert result.key == "clip_01"
+    assert result.meta["source"] == str(clip)
+    with pytest.raises(ValueError, match=r"column 'video' or 'mp4', got \['label'\]"):
+        list(pipe(datasets.Dataset.from_dict({"label": [3]})))
+
+
+def test_misspelled_items_are_refused(pipe, clip):
+    with pytest.raises(ValueError, match="camra"):
+        pipe({"video": str(clip), "camra": np.eye(3)})
+
+
+def test_absent_devices_are_refused_by_name():
+    with pytest.raises(ValueError, match=r"device: expected one of \[.*'cpu'\], got 'cuda:9'"):
+        pipeline("egocentric-hands", model=small_model(), devices=["cpu", "cuda:9"])
+
+
 def test_unknown_argument(pipe, clip):
     with pytest.raises(TypeError, match="smoothing"):
         pipe(str(clip), smoothing=True)
@@ -175,6 +199,9 @@ def test_unknown_argument(pipe, clip):
 def test_wrong_frames(pipe):
     with pytest.raises(ValueError, match=r"\(T, H, W, 3\)"):
         pipe(np.zeros((4, 8, 8, 2), np.uint8))
+    for wrong in (np.zeros((9, 30, 40), np.uint8), np.full((4, 8, 8, 3), 300, np.uint16)):
+        with pytest.raises(ValueError, match="expected"):
+            pipe(wrong)
     with pytest.raises(ValueError, match=r"in \[0, 1\]"):
         pipe(np.full((4, 8, 8, 3), 7.0, np.float32))
 

@@ -91,11 +91,26 @@ def test_wrong_config_is_refused_by_field(folder):
         ("camera_heads", 5),
         ("camera_iterations", 0),
         ("window", 0),
+        ("patch_size", 0),
+        ("num_register_tokens", -1),
     ],
 )
 def test_sizes_that_do_not_fit_are_named(field, value):
     with pytest.raises(StrictDataclassError, match=field):
         MintConfig(**{field: value})
+
+
+def test_config_of_another_project_is_not_ours(folder):
+    (folder / "config.json").write_text('{"model_type": "llama", "hidden_size": 192}')
+    with pytest.raises(ValueError, match=r"no config\.json of ours"):
+        MintModel.from_pretrained(folder)
+
+
+def test_file_cut_short_is_named(folder):
+    weights = folder / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:5000])
+    with pytest.raises(ValueError, match=r"release.*damaged or cut short"):
+        MintModel.from_pretrained(folder)
 
 
 def test_config_of_another_network_is_refused(folder):

@@ -212,7 +212,7 @@ def test_the_overlay_video_has_the_episodes_frames_and_times(episode, video, tmp
 
 def test_odd_sizes_lose_a_row_and_a_column(episode, video, tmp_path, monkeypatch):
     odd = [(k, image[:239, :319]) for k, image in overlay_frames(episode, video)]
-    monkeypatch.setattr(overlay, "overlay_frames", lambda *_: iter(odd))
+    monkeypatch.setattr(overlay, "overlay_frames", lambda *_, **__: iter(odd))
     path = overlay.write_overlay(episode, video, tmp_path / "o.mp4")
     assert probe(path).image_size_hw == (238, 318)
 

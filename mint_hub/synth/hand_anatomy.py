@@ -1,7 +1,7 @@
 """The anatomy of the licence-free hand: measured bones, and the flesh modelled around them.
 
 Millimetres, right hand, MANO's rest axes. The measurements and their sources are named in
-:mod:`mint_hub.assets.make_hand`.
+:mod:`mint_hub.synth.make_hand`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from mint_hub.assets.hand_surface import round_cone, smooth_min
+from mint_hub.synth.hand_surface import round_cone, smooth_min
 
 FINGERS: Final = ("index", "middle", "pinky", "ring", "thumb")
 """In the order of conventions.JOINT_NAMES."""

@@ -1,4 +1,4 @@
-"""Draw the sheet of poses and shapes: ``python -m mint_hub.assets.draw_hand``.
+"""Draw the sheet of poses and shapes: ``python -m mint_hub.synth.draw_hand``.
 
 A z-buffered rasteriser with smooth shading, in numpy; OpenCV only writes letters and the file.
 """
@@ -13,12 +13,13 @@ from typing import Final
 import cv2
 import numpy as np
 
-from mint_hub.assets.hand_anatomy import SPLAY_DEG, THUMB_DIRECTIONS, THUMB_PALMAR
-from mint_hub.assets.raster import fill, vertex_normals
+from mint_hub.assets import asset_path
 from mint_hub.conventions import JOINT_NAMES, Side
 from mint_hub.geometry.hand_model import HandModel
 from mint_hub.geometry.hand_state import HandState
 from mint_hub.geometry.rotations import rotvec_to_matrix
+from mint_hub.synth.hand_anatomy import SPLAY_DEG, THUMB_DIRECTIONS, THUMB_PALMAR
+from mint_hub.synth.raster import fill, vertex_normals
 
 PANEL: Final = 210
 OVERSAMPLING: Final = 2
@@ -211,7 +212,7 @@ def _panel(label: str, vertices: np.ndarray, faces: np.ndarray, view: np.ndarray
 def main() -> None:
     """Write the sheet beside this script, or to ``--out``."""
     parser = argparse.ArgumentParser(description="Draw the licence-free hand.")
-    default = Path(__file__).with_name("hand_template.png")
+    default = asset_path("hand_template.png")
     parser.add_argument("--out", type=Path, default=default)
     image = sheet(HandModel.template())
     out: Path = parser.parse_args().out

@@ -1,4 +1,4 @@
-"""Make the sample clip and its truth: ``python -m mint_hub.assets.make_sample``.
+"""Make the sample clip and its truth: ``python -m mint_hub.synth.make_sample``.
 
 Three seconds at a table, seen from the head: the right hand takes a mug and lifts it, the left one
 rests and then points at a box. Everything is computed here, the same every time: no picture, scan
@@ -18,10 +18,7 @@ from typing import Final
 import av
 import numpy as np
 
-from mint_hub.assets import sample_scene as scene
-from mint_hub.assets.draw_hand import POSES, pose
-from mint_hub.assets.sample_render import render
-from mint_hub.assets.sample_scene import Mesh
+from mint_hub.assets import asset_path
 from mint_hub.conventions import MODEL_FPS, SIDES, Side
 from mint_hub.geometry.camera import fov_vh_to_K, project
 from mint_hub.geometry.hand_model import HandModel
@@ -29,6 +26,10 @@ from mint_hub.geometry.hand_state import HandState, absent, unpack
 from mint_hub.geometry.rigid import inverse, rigid, transform_points
 from mint_hub.geometry.rotations import rotvec_to_matrix, slerp
 from mint_hub.loaders.schema import Episode, TextSegment
+from mint_hub.synth import sample_scene as scene
+from mint_hub.synth.draw_hand import POSES, pose
+from mint_hub.synth.sample_render import render
+from mint_hub.synth.sample_scene import Mesh
 
 SEED: Final = 7
 NUM_FRAMES: Final = 90
@@ -176,7 +177,7 @@ def truth(model: HandModel) -> Episode:
             "hand_model": model.name,
             "scale_status": "exact (synthetic)",
             "fps": MODEL_FPS,
-            "provenance": {"made_by": "python -m mint_hub.assets.make_sample"},
+            "provenance": {"made_by": "python -m mint_hub.synth.make_sample"},
         },
     )
 
@@ -262,7 +263,7 @@ def write_video(path: Path, frames: Sequence[np.ndarray]) -> None:
 def main() -> None:
     """Write sample.mp4 and sample.npz beside this script, or into ``--out``."""
     parser = argparse.ArgumentParser(description="Make the sample clip and its truth.")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent)
+    parser.add_argument("--out", type=Path, default=asset_path("sample.mp4").parent)
     out: Path = parser.parse_args().out
     model = HandModel.template()
     episode, textures = truth(model), scene.textures(SEED)

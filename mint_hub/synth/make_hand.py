@@ -1,4 +1,4 @@
-"""Make the licence-free hand: ``python -m mint_hub.assets.make_hand``.
+"""Make the licence-free hand: ``python -m mint_hub.synth.make_hand``.
 
 A right hand is modelled as rounded rods and muscle masses around the skeleton of an average adult,
 meshed, skinned, and given ten directions in which adults' hands differ. Nothing is scanned, learned
@@ -27,8 +27,10 @@ from typing import Final
 
 import numpy as np
 
-from mint_hub.assets.hand_anatomy import CARPAL_MM, FINGERS, Finger, fingers, hand_distance
-from mint_hub.assets.hand_surface import (
+from mint_hub.assets import asset_path
+from mint_hub.geometry.hand_asset import HandAsset, save_hand_asset
+from mint_hub.synth.hand_anatomy import CARPAL_MM, FINGERS, Finger, fingers, hand_distance
+from mint_hub.synth.hand_surface import (
     collapse_edges,
     is_closed,
     project,
@@ -36,7 +38,6 @@ from mint_hub.assets.hand_surface import (
     round_cone,
     surface_net,
 )
-from mint_hub.geometry.hand_asset import HandAsset, save_hand_asset
 
 CELL_MM: Final = 2.3
 NUM_VERTICES: Final = 2400
@@ -245,13 +246,13 @@ def make_hand(mesh: tuple[np.ndarray, np.ndarray] | None = None) -> HandAsset:
 def main() -> None:
     """Write the hand beside this script, or to ``--out``."""
     parser = argparse.ArgumentParser(description="Make the licence-free hand template.")
-    default = Path(__file__).with_name("hand_template.safetensors")
+    default = asset_path("hand_template.safetensors")
     parser.add_argument("--out", type=Path, default=default)
     metadata = {
         "name": "mint-hand-template-1",
         "license": "Apache-2.0",
         "shape_space": "mint",
-        "made_by": "python -m mint_hub.assets.make_hand",
+        "made_by": "python -m mint_hub.synth.make_hand",
         "units": "metres; fingers along -x, palm facing -y, thumb towards +z; right hand",
         "shape_meaning": "; ".join(SHAPE_MEANING),
     }

@@ -11,11 +11,11 @@ from typing import Final
 import cv2
 import numpy as np
 
-from mint_hub.assets import sample_scene as scene
-from mint_hub.assets.raster import fill, vertex_normals
-from mint_hub.assets.sample_scene import Mesh
 from mint_hub.geometry.camera import fov_vh_to_K, project
 from mint_hub.geometry.rigid import inverse, transform_points
+from mint_hub.synth import sample_scene as scene
+from mint_hub.synth.raster import fill, vertex_normals
+from mint_hub.synth.sample_scene import Mesh
 
 OVERSAMPLING: Final = 2
 SUN: Final = np.array([-0.42, -0.30, 0.86]) / np.linalg.norm([-0.42, -0.30, 0.86])
