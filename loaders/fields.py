@@ -94,6 +94,15 @@ ARRAY_FIELDS: Final = (
         description="confidence, 0 to 1, that the hand is there",
         optional=True,
     ),
+    ArrayField(
+        name="filled",
+        shape=("T", 2),
+        dtype="bool",
+        unit="",
+        frame="",
+        description="whether the hand is there by interpolation over a gap, not by observation",
+        optional=True,
+    ),
 )
 """The arrays of an episode, declared once: checks, files and dataset features follow this."""
 
@@ -150,6 +159,15 @@ class TextSegment:
             got = repr(values) if given is None else sorted(given)
             raise EpisodeError(f"text segment: expected {names}, got {got}")
         return cls(**given)
+
+
+def placed(error: EpisodeError, where: str, key: str = "") -> EpisodeError:
+    """Return the error with the shard and the episode at its end, each said once."""
+    message = str(error).removesuffix(f" (episode {key})")
+    place = ", ".join([*([where] if where else []), *([f"episode {key}"] if key else [])])
+    if not place:
+        return error
+    return EpisodeError(f"{message} in {place}" if where else f"{message} ({place})")
 
 
 def integer(value: object, place: str) -> int:
@@ -223,6 +241,12 @@ def check_values(arrays: Mapping[str, NDArray[Any]]) -> None:
     _check_range("fov_vh_rad", arrays["fov_vh_rad"], 0.0, math.pi, inclusive=False)
     if "presence_score" in arrays:
         _check_range("presence_score", arrays["presence_score"], 0.0, 1.0, inclusive=True)
+    if "filled" in arrays and (bad := np.argwhere(arrays["filled"] & ~arrays["presence"])).size:
+        frame, hand = (int(i) for i in bad[0])
+        raise EpisodeError(
+            f"filled: expected only hands that are present, got an absent one at frame {frame}, "
+            f"{SIDES[hand]}"
+        )
     state = hands.unpack(arrays["hand_state"])
     rot6d = np.concatenate(
         [state.orientation_rot6d_rows[..., None, :], state.joint_rot6d_rows], axis=-2

@@ -77,6 +77,7 @@ class Episode:
     hand_state: NDArray[np.float32]
     presence: NDArray[np.bool_]
     presence_score: NDArray[np.float32] | None = None
+    filled: NDArray[np.bool_] | None = field(default=None, kw_only=True)
     image_size_hw: tuple[int, int] = field(kw_only=True)
     text: tuple[TextSegment, ...] = ()
     meta: dict[str, Any] = field(default_factory=dict[str, Any])
@@ -269,7 +270,10 @@ class Episode:
             raise EpisodeError(f"{missing[0]}: expected this field, got none")
         if unknown := sorted(given.keys() - known):
             raise EpisodeError(f"{unknown[0]}: expected a field of an episode, got an unknown name")
-        given["text"] = tuple(map(TextSegment.from_dict, given.get("text") or ()))
+        text = given.get("text") or ()
+        if not isinstance(text, list | tuple):
+            raise EpisodeError(f"text: expected a list of segments, got {text!r}")
+        given["text"] = tuple(map(TextSegment.from_dict, text))  # pyright: ignore
         given["meta"] = given.get("meta") or {}
         return cls(**given)
 

@@ -1,7 +1,7 @@
 """mint-hub: egocentric video in, world-space camera and two-hand motion out.
 
-Importing this registers the names "mint" and "egocentric-hands" in transformers, whichever of the
-two is imported first, and imports neither transformers nor torch itself. Public names below are
+Importing this registers the names "mint" and "egocentric-hands" in transformers and "mint-ego" in
+datasets, whichever is imported first, and imports none of them, nor torch. Public names below are
 loaded when they are first used.
 """
 
@@ -14,6 +14,7 @@ from mint_hub.registration import register
 if TYPE_CHECKING:
     from mint_hub.geometry.hand_model import HandModel
     from mint_hub.inference.runner import MintRunner, RunSettings
+    from mint_hub.loaders.hub import load_dataset
     from mint_hub.loaders.schema import Episode
     from mint_hub.model.configuration_mint import MintConfig
     from mint_hub.model.modeling_mint import MintModel, MintOutput
@@ -29,6 +30,7 @@ _LAZY = {
     "MintRunner": "inference.runner",
     "MintVideoProcessor": "model.processing_mint",
     "RunSettings": "inference.runner",
+    "load_dataset": "loaders.hub",
 }
 
 __all__ = [
@@ -42,6 +44,7 @@ __all__ = [
     "MintVideoProcessor",
     "RunSettings",
     "__version__",
+    "load_dataset",
 ]
 
 

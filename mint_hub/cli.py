@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mint_hub import cli_corpus
 from mint_hub._version import __version__
 
 if TYPE_CHECKING:
@@ -49,6 +50,8 @@ def _parser() -> argparse.ArgumentParser:
     _add_predict(commands)
     _add_info(commands)
     _add_convert(commands)
+    cli_corpus.add_verify(commands)
+    cli_corpus.add_convert(commands)
     return parser
 
 

@@ -1,6 +1,6 @@
-"""Make transformers know MINT, whichever of the two packages is imported first.
+"""Make transformers know MINT and datasets know mint-ego, in whatever order they are imported.
 
-`import mint_hub` alone imports neither transformers nor torch: each hook below runs when the module
+`import mint_hub` alone imports neither of them, nor torch: each hook below runs when the module
 it names is imported, or at once if it already was (wrapt's post-import hooks). A hook may run in
 the middle of some other import of transformers, so what it registers is a stand-in that imports
 the real class at its first use; only the configuration, which needs next to nothing, is imported.
@@ -49,6 +49,12 @@ def _register_pipeline(module: ModuleType) -> None:
     register_pipeline(module.PIPELINE_REGISTRY)
 
 
+def _register_corpus(module: ModuleType) -> None:
+    from mint_hub.loaders.hub import answer_name
+
+    answer_name(module)
+
+
 def _config_class() -> Any:
     from mint_hub.model.configuration_mint import MintConfig
 
@@ -69,4 +75,6 @@ HOOKS: dict[str, Callable[[ModuleType], None]] = {
     ),
     f"{AUTO}.processing_auto": _register_class("PROCESSOR_MAPPING", _PROCESSING, "MintProcessor"),
     "transformers.pipelines": _register_pipeline,
+    "datasets.load": _register_corpus,
+    "datasets.inspect": _register_corpus,
 }

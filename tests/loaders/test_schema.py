@@ -39,6 +39,7 @@ def episode() -> Episode:
 
 
 def test_arrays_are_those_declared_and_cannot_be_written(episode):
+    episode = replace(episode, filled=np.zeros((24, 2), bool))
     for spec in ARRAY_FIELDS:
         array = getattr(episode, spec.name)
         assert array.dtype == np.dtype(spec.dtype)
@@ -88,6 +89,9 @@ def _with(array, index, value):
         ("fov_vh_rad", lambda x: _with(x, (1, 1), 0), r"0 < x < 3\.14.*, got 0\.0 at \(1, 1\)"),
         ("fov_vh_rad", lambda x: _with(x, (1, 1), 60), "got 60"),
         ("presence_score", lambda x: _with(x, (0, 0), 1.5), "0 <= x <= 1, got 1.5"),
+        ("filled", lambda _: np.ones((24, 2), bool), "hands that are present.* frame 12, left"),
+        ("filled", lambda _: np.zeros((23, 2), bool), r"with T = 24, got \(23, 2\)"),
+        ("filled", lambda _: np.zeros((24, 2)), "expected dtype bool, got float64"),
         ("image_size_hw", lambda _: (480, 0), "positive sizes"),
         ("image_size_hw", lambda _: (480.0, 640), "whole number, got 480.0"),
         ("image_size_hw", lambda _: 480, "expected \\(height, width\\)"),
@@ -227,6 +231,14 @@ def test_windows_cut_text_and_per_frame_meta(episode):
     assert [s.id for s in episode.window(12, 2).text] == ["b"]
 
 
+def test_windows_cut_what_is_filled(episode):
+    assert episode.filled is None
+    assert episode.window(10, 6).filled is None
+    filled = episode.presence & (np.arange(24) % 3 == 0)[:, None]
+    window = replace(episode, filled=filled).window(10, 6)
+    np.testing.assert_array_equal(window.filled, filled[10:16])
+
+
 @pytest.mark.parametrize(("start", "length"), [(-1, 3), (0, 0), (22, 3), (24, 1)])
 def test_windows_beyond_the_frames_are_refused(episode, start, length):
     with pytest.raises(EpisodeError, match=f"got start {start}, length {length}"):
@@ -242,6 +254,7 @@ def test_allclose_sees_every_field(episode):
         "hand_state": _with(episode.hand_state, (3, 0, 108), 9),
         "presence": ~episode.presence,
         "presence_score": None,
+        "filled": np.zeros((24, 2), bool),
         "image_size_hw": (640, 480),
         "text": (),
         "meta": {},
@@ -269,16 +282,19 @@ json_values = st.recursive(
     num_frames=st.integers(1, 12),
     seed=st.integers(0, 99),
     scored=st.booleans(),
+    marked=st.booleans(),
     text=st.text(),
     extra=json_values,
 )
 def test_file_and_dict_give_back_the_episode(
-    tmp_path_factory, num_frames, seed, scored, text, extra
+    tmp_path_factory, num_frames, seed, scored, marked, text, extra
 ):
     segment = TextSegment("ü", text, None, 0, num_frames)
     made = replace(make_episode(num_frames, seed, meta={"extra": extra}), text=(segment,))
     if not scored:
         made = replace(made, presence_score=None)
+    if marked:
+        made = replace(made, filled=made.presence & (np.arange(num_frames) % 2 == 0)[:, None])
     path = made.save(tmp_path_factory.mktemp("episode") / "x.npz")
     assert Episode.load(path).allclose(made, atol=0)
     assert Episode.from_dict(made.to_dict()).allclose(made, atol=0)

@@ -160,7 +160,7 @@ def test_variable_rate_keeps_the_map_to_source_times(tmp_path):
 def test_grid_law(gaps, fps, t0_ms):
     """Every output shows the stored frame nearest in time, on the grid, to the end."""
     stored_ms = np.cumsum([0, *gaps])
-    stored = [video._Stored(ms / 1000, 0.02, i, None) for i, ms in enumerate(stored_ms)]
+    stored = [video.Stored(ms / 1000, 0.02, i, None) for i, ms in enumerate(stored_ms)]
     t0 = t0_ms / 1000
     picks = list(video._grid(iter(stored), t0, fps))
     end = stored[-1].time_s + 0.02

@@ -1,0 +1,329 @@
+"""From LeRobot v3 roots, local or remote, to Episodes, one at a time.
+
+``from_lerobot`` reads one root: it goes through the data files in order, keeps one batch of rows
+and one episode in memory, and holds 60 bytes an episode of index, so that 1,021 hours need neither
+a second copy nor more memory than a single file.
+"""
+
+import json
+import logging
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, Final, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mint_hub.geometry.camera import fov_vh_to_K
+from mint_hub.loaders import lerobot_codec, lerobot_files, lerobot_text
+from mint_hub.loaders.lerobot_columns import (
+    EXTRA,
+    Column,
+    Dialect,
+    LeRobotError,
+    columns_of,
+    dialect_of,
+)
+from mint_hub.loaders.lerobot_files import Root, open_root, read_tasks
+from mint_hub.loaders.lerobot_index import INDEX_COLUMNS, check_spans, episode_index
+from mint_hub.loaders.schema import SCHEMA_VERSION, Episode, EpisodeError
+
+SCALE_STATUS: Final = "scale-enlarged pseudo-label, not metric"
+"""What the published labels are."""
+
+CONVENTIONS: Final = "camera: world-to-camera, OpenCV axes, metres; hands: camera frame"
+VIDEO_KEY: Final = "observation.images.ego"
+OURS: Final = "mint_episode"
+"""Column of our own exports: JSON of what an Episode says beyond LeRobot's columns."""
+
+INTRINSICS_TOLERANCE: Final = 0.02
+"""How far ``intrinsics`` may be from those of ``fov``, in image sides, before a warning."""
+
+_ALIASES: Final = {"epickitchen": "epic", "epic-kitchens": "epic", "epic-kitchens-100": "epic"}
+_DOMAINS: Final = {"ego4d": "daily", "epic": "kitchen", "egodex": "tabletop"}
+_UID_COLUMNS: Final = ("video_uid", "uid", "video_id")
+_TOLD: Final = ("key", "image_size_hw", "text", "meta", "schema_version")
+_BULK: Final = ("stats/", "meta/episodes/")
+_LOG: Final = logging.getLogger(__name__)
+
+
+def from_lerobot(
+    root: str | os.PathLike[str],
+    source: str | None = None,
+    episodes: Iterable[int] | None = None,
+    *,
+    scale_status: str = SCALE_STATUS,
+    image_size_hw: tuple[int, int] | None = None,
+    on_error: Literal["raise", "skip"] = "raise",
+    storage_options: dict[str, Any] | None = None,
+) -> Iterator[Episode]:
+    """Read the episodes of a LeRobot v3 root, in the order in which they lie in its files.
+
+    Both dialects (``lerobot_columns``) give the same Episode: hands in the camera frame, fields of
+    view (vertical, horizontal), presence from ``hand_kept`` or ``{side}_kept``. Nothing is scaled
+    or smoothed; an absent hand is ``hand_state.absent``. Times are those of the episode's video
+    file: ``from_timestamp + k / fps``, from 0 where the root has no video. Keys are
+    ``<source>-<video uid>-<episode index>``, without the uid where the root does not say it.
+
+    Args:
+        root: a folder, or an address that fsspec opens (``hf://datasets/org/name/ego4d``).
+        source: name of the source; default: what info.json says, else the folder's name.
+        episodes: episode indices to read; default all.
+        scale_status: what the labels' lengths are, for ``meta["scale_status"]``.
+        image_size_hw: (height, width) that the field of view belongs to; default: the size of
+            ``observation.images.ego`` in info.json.
+        on_error: "skip" leaves out, with a logged warning, an episode whose values are wrong; a
+            missing file or column always raises.
+        storage_options: what fsspec passes to the file system.
+
+    Raises:
+        LeRobotError: a ValueError that names file, column, episode, what was expected and came.
+
+    """
+    if on_error not in ("raise", "skip"):
+        raise ValueError(f"on_error: expected 'raise' or 'skip', got {on_error!r}")
+    opened = open_root(root, storage_options)
+    reader = _Reader(opened, source, scale_status, image_size_hw)
+    index = episode_index(opened)
+    chosen = np.ones(len(index), bool)
+    if episodes is not None:
+        wanted = np.unique(np.fromiter(episodes, np.int64))
+        if absent := np.setdiff1d(wanted, index["episode_index"]).tolist():
+            got = f"{len(index)} episodes without {absent[:5]}"
+            raise LeRobotError(
+                f"{opened.name(lerobot_files.EPISODES)}: expected {absent[:5]}, got {got}"
+            )
+        chosen = np.isin(index["episode_index"], wanted)
+    return reader.read(index, chosen, skip=on_error == "skip")
+
+
+def lerobot_episodes(
+    root: str | os.PathLike[str], storage_options: dict[str, Any] | None = None
+) -> list[int]:
+    """Return the episode indices of a root in reading order.
+
+    Contiguous slices of it, as ``from_lerobot(root, episodes=part)``, divide the work among
+    processes without reading a file twice but at the seams.
+    """
+    return episode_index(open_root(root, storage_options))["episode_index"].tolist()
+
+
+def lerobot_roots(
+    folder: str | os.PathLike[str], storage_options: dict[str, Any] | None = None
+) -> list[str]:
+    """Return the LeRobot roots at ``folder`` or up to two folders below it, sorted."""
+    import fsspec
+
+    address = os.fspath(folder).rstrip("/")
+    filesystem, path = fsspec.core.url_to_fs(address, **(storage_options or {}))
+    path = str(path).rstrip("/")
+    found = {
+        str(name)[len(path) : -len(lerobot_files.INFO)].strip("/")
+        for depth in ("", "*/", "*/*/")
+        for name in filesystem.glob(f"{path}/{depth}{lerobot_files.INFO}")
+    }
+    return [f"{address}/{name}" if name else address for name in sorted(found)]
+
+
+class _Reader:
+    """What all episodes of a root share while they are read."""
+
+    def __init__(
+        self, root: Root, source: str | None, scale_status: str, size: tuple[int, int] | None
+    ) -> None:
+        self.root = root
+        self.source = source or _source_of(root)
+        self.scale_status = scale_status
+        self.size = size
+        self.tasks = read_tasks(root)
+        self.episode_files = root.episode_files()
+        self.rows: tuple[int, Any] | None = None
+
+    def read(self, index: NDArray[Any], chosen: NDArray[Any], skip: bool) -> Iterator[Episode]:
+        """Yield the chosen episodes, one data file after the other."""
+        places = index[["data/chunk_index", "data/file_index"]]
+        bounds = np.flatnonzero(np.append(True, places[1:] != places[:-1]))
+        for first, last in zip(bounds, [*bounds[1:], len(index)], strict=True):
+            part = index[first:last][chosen[first:last]]
+            if len(part):
+                yield from self._read_file(part, skip)
+
+    def _read_file(self, part: NDArray[Any], skip: bool) -> Iterator[Episode]:
+        """Yield the episodes of one data file; ``part`` is sorted by first row."""
+        path = self.root.data_file(
+            int(part[0]["data/chunk_index"]), int(part[0]["data/file_index"])
+        )
+        where = self.root.name(path)
+        starts = part["dataset_from_index"] - part["base"]
+        stops = starts + part["length"]
+        with self.root.parquet(path) as file:
+            names = file.schema_arrow.names
+            try:
+                dialect = dialect_of(names)
+            except LeRobotError as error:
+                raise LeRobotError(f"{where}: {error}") from None
+            check_spans(where, part, starts, stops, file.metadata.num_rows)
+            columns = [c for c in columns_of(dialect, extra=True) if c.name in names]
+            wanted = list(zip(starts.tolist(), stops.tolist(), strict=True))
+            for number, table in lerobot_files.spans(file, [c.name for c in columns], wanted):
+                entry = part[number]
+                place = f"{where}, episode {entry['episode_index']}"
+                try:
+                    yield self._episode(entry, path, dialect, columns, table)
+                except (LeRobotError, EpisodeError) as error:
+                    if not skip:
+                        raise LeRobotError(f"{place}: {error}") from None
+                    _LOG.warning("skipped %s: %s", place, error)
+
+    def _episode(
+        self,
+        entry: NDArray[Any],
+        path: str,
+        dialect: Dialect,
+        columns: list[Column],
+        table: Any,
+    ) -> Episode:
+        got = {c.name: lerobot_files.values(table, c) for c in columns}
+        _check_counters(got, entry)
+        row = self._row(entry)
+        arrays = lerobot_codec.decode(dialect, got)
+        ours = _ours(row[OURS]) if row.get(OURS) else None
+        there = ours["extra"] if ours else [c.name for c in EXTRA]
+        optional = {c.name: got.get(c.name) if c.name in there else None for c in EXTRA}
+        told = ours or self._described(entry, row, path, dialect, got)
+        length, times = int(entry["length"]), optional["timestamp_s"]
+        return Episode.from_dict(
+            {
+                "timestamps_s": told["start_s"] + np.arange(length) / self.root.fps
+                if times is None
+                else times,
+                "presence_score": optional["presence_score"],
+                "filled": optional["hand_filled"],
+                **arrays,
+                **{name: told[name] for name in _TOLD},
+            }
+        )
+
+    def _row(self, entry: NDArray[Any]) -> dict[str, Any]:
+        """Return everything that meta/episodes says of an episode, but its statistics."""
+        number = int(entry["file"])
+        if self.rows is None or self.rows[0] != number:
+            with self.root.parquet(self.episode_files[number]) as file:
+                names = [n for n in file.schema_arrow.names if not n.startswith(_BULK)]
+                self.rows = number, file.read(columns=names)
+        return self.rows[1].slice(int(entry["row"]), 1).to_pylist()[0]
+
+    def _described(
+        self,
+        entry: NDArray[Any],
+        row: Mapping[str, Any],
+        path: str,
+        dialect: Dialect,
+        got: Mapping[str, NDArray[Any]],
+    ) -> dict[str, Any]:
+        """Return what an episode of another project's root is called and where it is from."""
+        number = int(entry["episode_index"])
+        text, warnings = lerobot_text.segments(row, self.tasks, got.get("main_type"))
+        uid = next((str(row[name]) for name in _UID_COLUMNS if row.get(name)), None)
+        if dialect == "world":
+            warnings += _doubts(got, self._image_size())
+        video = {
+            n.rsplit("/", 1)[1]: v for n, v in row.items() if n.startswith(f"videos/{VIDEO_KEY}/")
+        }
+        known = {c.name for c in INDEX_COLUMNS} | {"tasks", "atomic_segments", "dataset_to_index"}
+        other = {n: v for n, v in row.items() if n not in known and not n.startswith("videos/")}
+        meta: dict[str, Any] = {
+            "source": self.source,
+            "uid": uid or f"{self.source}-{number:06d}",
+            "domain": _DOMAINS.get(self.source),
+            "tasks": list(row.get("tasks") or ()),
+            "main_hand": lerobot_text.main_hand(got.get("main_type")),
+            "fps": self.root.fps,
+            "scale_status": self.scale_status,
+            "shape_space": "mano",
+            "conventions": CONVENTIONS,
+            "provenance": {
+                "format": f"LeRobot {self.root.info['codebase_version']}, {dialect} dialect",
+                "root": self.root.address,
+                "file": path,
+                "row": int(entry["dataset_from_index"] - entry["base"]),
+                "episode_index": number,
+                "video": video or None,
+                "columns": json.loads(json.dumps(other, default=str)),
+            },
+            "warnings": warnings,
+        }
+        parts = (self.source, uid, f"{number:06d}")
+        return {
+            "key": "-".join(slug(part) for part in parts if part),
+            "image_size_hw": self._image_size(),
+            "text": [segment.to_dict() for segment in text],
+            "schema_version": SCHEMA_VERSION,
+            "start_s": float(video.get("from_timestamp") or 0.0),
+            "meta": {name: value for name, value in meta.items() if value is not None},
+        }
+
+    def _image_size(self) -> tuple[int, int]:
+        if self.size is not None:
+            return self.size
+        feature = self.root.info.get("features", {}).get(VIDEO_KEY, {})
+        shape, names = feature.get("shape") or (), feature.get("names") or ()
+        if len(shape) != 3:
+            raise LeRobotError(
+                f"{self.root.name(lerobot_files.INFO)}: features[{VIDEO_KEY!r}]['shape']: expected "
+                f"(height, width, 3), got {list(shape)}: pass image_size_hw"
+            )
+        first = [str(name)[:1] for name in names]
+        height, width = (first.index("h"), first.index("w")) if {"h", "w"} <= set(first) else (0, 1)
+        return int(shape[height]), int(shape[width])
+
+
+def _check_counters(got: Mapping[str, NDArray[Any]], entry: NDArray[Any]) -> None:
+    """Refuse rows that are of another episode, or not its frames 0, 1, 2, ..."""
+    length, number = int(entry["length"]), int(entry["episode_index"])
+    expected = {"episode_index": np.full(length, number), "frame_index": np.arange(length)}
+    for name, want in expected.items():
+        if (bad := np.flatnonzero(got[name] != want)).size:
+            k = int(bad[0])
+            raise LeRobotError(f"{name}: expected {want[k]}, got {got[name][k]} at frame {k}")
+
+
+def _ours(text: str) -> dict[str, Any]:
+    """Return what our own export says of an episode."""
+    try:
+        told = json.loads(text)
+    except ValueError as error:
+        raise LeRobotError(f"{OURS}: expected JSON, got an error: {error}") from None
+    names = [*_TOLD, "start_s", "extra"]
+    missing = [n for n in names if n not in told] if isinstance(told, dict) else names
+    if missing:
+        raise LeRobotError(f"{OURS}: expected the entries {names}, got none called {missing}")
+    return cast("dict[str, Any]", told)
+
+
+def _doubts(got: Mapping[str, NDArray[Any]], image_size_hw: tuple[int, int]) -> list[str]:
+    """Warnings about an episode in the world dialect."""
+    doubts: list[str] = []
+    if "observation.state" not in got:
+        doubts.append("no hand shape in the source: zeros, the mean shape")
+    if "intrinsics" in got:
+        stated = got["intrinsics"].reshape(-1, 3, 3)
+        apart = np.abs(fov_vh_to_K(got["fov"][:, ::-1], image_size_hw) - stated).max()
+        if not apart <= INTRINSICS_TOLERANCE * max(image_size_hw):
+            doubts.append(
+                f"intrinsics differ by {apart:.1f} px from fov, which is used, and image size"
+            )
+    return doubts
+
+
+def slug(name: str) -> str:
+    """Return a name in characters that keys may have: others become '-'."""
+    return re.sub(r"[^a-z0-9_-]+", "-", name.lower()).strip("-") or "x"
+
+
+def _source_of(root: Root) -> str:
+    said = root.info.get("_source_dataset")
+    parts = [p for p in re.split(r"[/\\]+", root.folder) if not p.lower().startswith("lerobot")]
+    name = slug(str(said or (parts[-1] if parts else "lerobot")))
+    return _ALIASES.get(name, name)

@@ -1,0 +1,67 @@
+"""One function over many items, in several processes, with the results in the items' order."""
+
+import multiprocessing
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from itertools import islice
+from typing import Any, TypeVar
+
+from mint_hub.loaders.tar_layout import CorpusError
+
+T = TypeVar("T")
+
+_function: Callable[[Any], Any] | None = None
+"""What this process does with every item; set in worker processes only."""
+
+
+def in_order(
+    function: Callable[[Any], T], items: Iterable[Any], num_procs: int = 1, batch: int = 16
+) -> Generator[T]:
+    """Yield ``function(item)`` for every item, in their order, whatever the number of processes.
+
+    Items are taken a few batches ahead of the reader, never all at once. ``function`` travels to
+    each process once. Processes end with the generator, and also when their parent is killed.
+
+    Raises:
+        CorpusError: a process died. What ``function`` raises is raised here.
+
+    """
+    if num_procs <= 1:
+        yield from map(function, items)
+        return
+    stream = iter(items)
+    waiting: deque[Future[list[T]]] = deque()
+    try:
+        with ProcessPoolExecutor(num_procs, initializer=_begin, initargs=(function,)) as pool:
+            while part := list(islice(stream, batch)):
+                waiting.append(pool.submit(_do, part))
+                if len(waiting) > 2 * num_procs:
+                    yield from waiting.popleft().result()
+            while waiting:
+                yield from waiting.popleft().result()
+    except BrokenProcessPool:
+        raise CorpusError(
+            "a worker process died (out of memory?): call again, with a lower num_procs"
+        ) from None
+
+
+def _begin(function: Callable[[Any], Any]) -> None:
+    global _function
+    _function = function
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
+
+
+def _leave_with_parent() -> None:
+    """End this process when its parent was killed; it would wait for work for ever."""
+    if (parent := multiprocessing.parent_process()) is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _do(items: list[Any]) -> list[Any]:
+    assert _function is not None
+    return [_function(item) for item in items]

@@ -1,0 +1,129 @@
+"""The verbs of the command line that work on the corpus: verify, convert."""
+
+import argparse
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mint_hub.loaders.schema import Episode
+
+
+def add_verify(commands: Any) -> None:
+    """Add `mint-hub verify`."""
+    parser = commands.add_parser(
+        "verify",
+        help="check the files of a corpus against what was written",
+        description="Check a corpus, a config or a split: every file that is missing, cut short, "
+        "swapped, damaged or unfinished is named with the episodes lost in it. Exit code 1 if any.",
+    )
+    parser.add_argument("folder", type=Path, help="a corpus, one of its configs, or one split")
+    parser.add_argument("--full", action="store_true", help="also compare checksums (reads it all)")
+    parser.set_defaults(verb=_verify)
+
+
+def _verify(args: argparse.Namespace) -> int:
+    from mint_hub.loaders.integrity import verify
+
+    report = verify(args.folder, "full" if args.full else "size")
+    print(report)
+    return 0 if report.ok else 1
+
+
+def add_convert(commands: Any) -> None:
+    """Add `mint-hub convert`."""
+    parser = commands.add_parser(
+        "convert",
+        help="labels in other formats to corpus shards",
+        description="Write FORMAT's labels as a config of a corpus: lerobot (LeRobot v3 roots, "
+        "local or hf://), vitra (.npy annotations), hot3d (raw sequences). Interrupted, the same "
+        "command goes on. Train and validation are told apart by participant, else by video.",
+    )
+    add = parser.add_argument
+    add("format", choices=sorted(_READERS), help="what the sources are")
+    add("sources", nargs="+", help="roots, files or folders")
+    add("-o", "--out", type=Path, required=True, help="folder of the corpus")
+    add("--config", required=True, help="name of the config to write, e.g. ego4d")
+    add("--split", choices=("auto", "train", "validation"), default="auto", help="default: auto")
+    add("--lossless", action="store_true", help="keep all 109 numbers of every hand as float32")
+    add("--extra", action="store_true", help="keep exact times and presence scores")
+    add("--mano", type=Path, help="folder with your MANO files (hot3d)")
+    add("--num-procs", type=int, default=1, help="processes that encode (default: 1)")
+    add("--quiet", action="store_true", help="no progress bar")
+    parser.set_defaults(verb=_convert)
+
+
+def _convert(args: argparse.Namespace) -> int:
+    from mint_hub.loaders.card import write_card
+    from mint_hub.loaders.shards import split_of, write_corpus
+
+    read = _READERS[args.format]
+    splits = ("train", "validation") if args.split == "auto" else (args.split,)
+    counts: dict[str, int] = dict.fromkeys(splits, 0)
+    if args.split == "auto":
+        counts |= _count_splits(read(args), split_of)
+    if not any(counts.values()) and args.split == "auto":
+        raise ValueError(f"{args.sources}: expected episodes, found none")
+    for split in splits:
+        if args.split == "auto" and not counts[split]:
+            print(f"{args.config}/{split}: no episodes fall here")
+            continue
+
+        def chosen(split: str = split) -> "Iterator[Episode]":
+            for episode in read(args):
+                if args.split != "auto" or _split(episode, split_of) == split:
+                    yield episode
+
+        report = write_corpus(
+            chosen,
+            args.out,
+            args.config,
+            split,
+            format="lossless" if args.lossless else "compact",
+            extra=args.extra,
+            num_procs=args.num_procs,
+            progress=not args.quiet,
+        )
+        print(report)
+    print(f"card: {write_card(args.out)}")
+    return 0
+
+
+def _count_splits(episodes: "Iterator[Episode]", split_of: Callable[..., str]) -> dict[str, int]:
+    counts = {"train": 0, "validation": 0}
+    for episode in episodes:
+        counts[_split(episode, split_of)] += 1
+    return counts
+
+
+def _split(episode: "Episode", split_of: Callable[..., str]) -> str:
+    uid = episode.meta.get("uid") or episode.key
+    return split_of(str(uid), episode.meta.get("participant"))
+
+
+def _read_lerobot(args: argparse.Namespace) -> "Iterator[Episode]":
+    from mint_hub.loaders.lerobot import from_lerobot
+
+    for root in args.sources:
+        yield from from_lerobot(root)
+
+
+def _read_vitra(args: argparse.Namespace) -> "Iterator[Episode]":
+    from mint_hub.loaders.vitra import from_vitra
+
+    for path in args.sources:
+        yield from_vitra(path)
+
+
+def _read_hot3d(args: argparse.Namespace) -> "Iterator[Episode]":
+    from mint_hub.loaders.hot3d import from_hot3d
+
+    for folder in args.sources:
+        yield from_hot3d(folder, mano_dir=args.mano)
+
+
+_READERS: dict[str, Callable[[argparse.Namespace], "Iterator[Episode]"]] = {
+    "hot3d": _read_hot3d,
+    "lerobot": _read_lerobot,
+    "vitra": _read_vitra,
+}
