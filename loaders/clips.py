@@ -85,7 +85,9 @@ def encode_clip(
             raise ValueError(f"{name}: expected {low} to {high}, got {value}")
     if not (math.isfinite(fps) and fps > 0):
         raise ValueError(f"fps: expected frames a second, got {fps}")
-    x264 = f"keyint={gop}:min-keyint={gop}:scenecut=0:bframes=0:open-gop=0:threads=1"
+    # One thread and no look at later frames: with mbtree the bytes varied now and then.
+    steady = "threads=1:mbtree=0:rc-lookahead=0:weightp=0"
+    x264 = f"keyint={gop}:min-keyint={gop}:scenecut=0:bframes=0:open-gop=0:{steady}"
     options = {"preset": preset, "crf": str(crf), "x264-params": x264}
     if isinstance(source, np.ndarray | list | tuple | Iterator):
         if start_s is not None or stop_s is not None:
@@ -127,6 +129,7 @@ def _encoded(images: Iterator[Images], fps: float, size_hw: Size, options: dict[
             stream = container.add_stream("libx264", rate=rate, options=options)
             stream.height, stream.width, stream.pix_fmt = height, width, "yuv420p"
             stream.codec_context.flags |= Flags.bitexact
+            stream.codec_context.thread_count = 1
             stream.codec_context.colorspace = _BT601
             stream.codec_context.color_range = _LIMITED
             for k, image in enumerate(chain([first], images)):
