@@ -52,6 +52,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_convert(commands)
     cli_corpus.add_verify(commands)
     cli_corpus.add_convert(commands)
+    cli_corpus.add_pack(commands)
     return parser
 
 

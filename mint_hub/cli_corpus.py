@@ -122,6 +122,69 @@ def _read_hot3d(args: argparse.Namespace) -> "Iterator[Episode]":
         yield from_hot3d(folder, mano_dir=args.mano)
 
 
+def add_pack(commands: Any) -> None:
+    """Add `mint-hub pack`."""
+    parser = commands.add_parser(
+        "pack",
+        help="your own videos into shards, beside their labels",
+        description="Write a config whose samples hold a short-GOP clip beside the labels, from "
+        "videos that you have. Interrupted, the same command goes on.",
+    )
+    add = parser.add_argument
+    add("corpus", help="folder or address of the corpus with the labels")
+    add("--config", required=True, help="its config, e.g. ego4d")
+    add("--split", default="train", help="its split (default: train)")
+    add("--videos", type=Path, required=True, help="folder of the videos (or one video)")
+    layouts = ("folder", "ego4d", "epic", "egodex")
+    add("--layout", choices=layouts, default="folder", help="how the folder is laid out")
+    add("-o", "--out", type=Path, required=True, help="folder of the corpus to write")
+    add("--name", help="config to write (default: CONFIG-video)")
+    add("--size", help="height x width of the clips, e.g. 224x224 (default: the episode's)")
+    add("--skip-missing", action="store_true", help="leave out episodes whose video is missing")
+    add("--num-procs", type=int, default=1, help="processes that encode (default: 1)")
+    add("--quiet", action="store_true", help="no progress bar")
+    parser.set_defaults(verb=_pack)
+
+
+def _pack(args: argparse.Namespace) -> int:
+    from mint_hub.loaders import resolvers
+    from mint_hub.loaders.card import write_card
+    from mint_hub.loaders.packing import Packer, pack_corpus
+    from mint_hub.loaders.reader import CorpusReader
+
+    layouts = {
+        "folder": lambda root: root,
+        "ego4d": resolvers.Ego4DVideos,
+        "epic": resolvers.EpicVideos,
+        "egodex": resolvers.EgoDexVideos,
+    }
+    packer = Packer(layouts[args.layout](args.videos), size_hw=_size(args.size))
+    report = pack_corpus(
+        CorpusReader(args.corpus, args.config, args.split),
+        packer,
+        args.out,
+        args.name or f"{args.config}-video",
+        args.split,
+        on_missing="skip" if args.skip_missing else "raise",
+        num_procs=args.num_procs,
+        progress=not args.quiet,
+    )
+    print(report.corpus)
+    for key in report.missing:
+        print(f"left out, no video: {key}")
+    print(f"card: {write_card(args.out)}")
+    return 1 if report.missing else 0
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    parts = text.split("x")
+    if len(parts) != 2 or not all(part.isdigit() and int(part) for part in parts):
+        raise ValueError(f"--size: expected height x width such as 224x224, got {text!r}")
+    return int(parts[0]), int(parts[1])
+
+
 _READERS: dict[str, Callable[[argparse.Namespace], "Iterator[Episode]"]] = {
     "hot3d": _read_hot3d,
     "lerobot": _read_lerobot,
