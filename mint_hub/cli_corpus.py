@@ -152,8 +152,8 @@ def _pack(args: argparse.Namespace) -> int:
     from mint_hub.loaders.packing import Packer, pack_corpus
     from mint_hub.loaders.reader import CorpusReader
 
-    layouts = {
-        "folder": lambda root: root,
+    layouts: dict[str, Any] = {
+        "folder": Path,
         "ego4d": resolvers.Ego4DVideos,
         "epic": resolvers.EpicVideos,
         "egodex": resolvers.EgoDexVideos,

@@ -86,11 +86,11 @@ def channels_first(video: Any, layout: str | ChannelDimension | None) -> torch.T
     video = video.permute(0, 3, 1, 2) if use_last else video
     if video.is_floating_point() or video.dtype == torch.uint8:
         return video
-    video = video.to(torch.int64)
-    low, high = int(video.min()), int(video.max())
+    wide = video.to(torch.int64)  # some unsigned types know no minimum
+    low, high = int(wide.min()), int(wide.max())
     if video.dtype == torch.bool or low < 0 or high > 255:
         raise ValueError(f"videos: expected 0..255, got {low}..{high} as {video.dtype}")
-    return video.to(torch.uint8)
+    return wide.to(torch.uint8)
 
 
 def check_unit_range(frames: torch.Tensor) -> None:
