@@ -131,13 +131,8 @@ def poses_at(spec: Any, timestamps_s: Float) -> Float:
             f"camera_poses: expected times that cover the video, {timestamps_s[0]:.3f} to "
             f"{timestamps_s[-1]:.3f} s, got {times[0]:.3f} to {times[-1]:.3f} s"
         )
-    after = np.clip(np.searchsorted(times, timestamps_s, side="right"), 1, len(times) - 1)
-    alpha = (timestamps_s - times[after - 1]) / (times[after] - times[after - 1])
-    # Interpolate the camera's place in the world, not the inverse.
-    T_world_from_camera = rigid.inverse(poses)
-    between = rigid.interpolate_rigid(
-        T_world_from_camera[after - 1], T_world_from_camera[after], np.clip(alpha, 0, 1)
-    )
+    T_world_from_camera = rigid.inverse(poses)  # it is the camera's place that moves straight
+    between = rigid.interpolate_path(times, T_world_from_camera, timestamps_s)
     return np.asarray(rigid.inverse(between))
 
 
