@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mint_hub.conventions import MODEL_FPS
 from mint_hub.geometry.lenses import PinholeLens, Rectification, lens_from, rectification
-from mint_hub.loaders.fields import checked_size
+from mint_hub.loaders.fields import checked_size, require_window
 from mint_hub.loaders.resolvers import VideoReference, Videos, resolve
 from mint_hub.loaders.schema import Episode
 from mint_hub.loaders.video_decoder import VideoInfo
@@ -146,11 +146,7 @@ class VideoAttachment:
 
         """
         length = self.num_frames - start if length is None else length
-        if start < 0 or length < 1 or start + length > self.num_frames:
-            raise ValueError(
-                f"window: expected 1 <= length and 0 <= start <= {self.num_frames} - length, "
-                f"got start {start}, length {length} (episode {self.reference.key})"
-            )
+        require_window(start, length, self.num_frames, self.reference.key)
         size = self.reference.image_size_hw if size_hw is None else checked_size(size_hw)
         times = self.reference.timestamps_s[start : start + length] + self.offset_s
         with self._cache().reader(self.source) as reader:

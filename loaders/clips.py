@@ -25,7 +25,7 @@ from av.video.reformatter import Interpolation
 from numpy.typing import NDArray
 
 from mint_hub.conventions import MODEL_FPS
-from mint_hub.loaders.fields import checked_size
+from mint_hub.loaders.fields import checked_size, require_window
 from mint_hub.loaders.video import iter_frames
 from mint_hub.loaders.video_reader import VideoReader, tensor
 from mint_hub.loaders.video_source import VideoError, VideoSource
@@ -177,11 +177,7 @@ class PackedClip:
 
         """
         length = self.num_frames - start if length is None else length
-        if start < 0 or length < 1 or start + length > self.num_frames:
-            raise ValueError(
-                f"window: expected 1 <= length and 0 <= start <= {self.num_frames} - length, "
-                f"got start {start}, length {length}"
-            )
+        require_window(start, length, self.num_frames)
         return self._reader.at((start + np.arange(length)) / self.fps, size_hw).images
 
     def close(self) -> None:

@@ -194,6 +194,16 @@ def checked_size(value: object) -> tuple[int, int]:
     return height, width
 
 
+def require_window(start: int, length: int, num_frames: int, key: str | None = None) -> None:
+    """Raise EpisodeError unless frames start .. start + length - 1 are among ``num_frames``."""
+    if start < 0 or length < 1 or start + length > num_frames:
+        place = "" if key is None else f" (episode {key})"
+        raise EpisodeError(
+            f"window: expected 1 <= length and 0 <= start <= {num_frames} - length, "
+            f"got start {start}, length {length}{place}"
+        )
+
+
 def checked_array(spec: ArrayField, value: object, num_frames: int | None) -> NDArray[Any]:
     """Return ``value`` as the declared read-only array.
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mint_hub.loaders.fields import require_window
 from mint_hub.loaders.index import read_rows
 from mint_hub.loaders.manifest import EPISODES, INDEX, FileRecord
 from mint_hub.loaders.members import decode
@@ -407,10 +408,7 @@ class CorpusReader(Sequence[Episode]):
         bad = np.flatnonzero((start < 0) | (length < 1) | (start + length > self.num_frames[index]))
         if bad.size:
             i = int(index[bad[0]])
-            raise ValueError(
-                f"window: expected 1 <= length and 0 <= start <= {self.num_frames[i]} - length, "
-                f"got start {start[bad[0]]}, length {length} (episode {self.key(i)})"
-            )
+            require_window(int(start[bad[0]]), length, int(self.num_frames[i]), self.key(i))
 
 
 def _check_option(name: str, value: str, known: tuple[str, ...]) -> None:

@@ -206,11 +206,7 @@ class Episode:
 
         """
         stop = start + length
-        if start < 0 or length < 1 or stop > self.num_frames:
-            raise EpisodeError(
-                f"window: expected 1 <= length and 0 <= start <= {self.num_frames} - length, "
-                f"got start {start}, length {length} (episode {self.key})"
-            )
+        checks.require_window(start, length, self.num_frames, self.key)
         text = (
             replace(s, start=max(s.start, start) - start, end=min(s.end, stop) - start)
             for s in self.text

@@ -1,4 +1,4 @@
-"""The verbs of the command line that work on the corpus: verify, convert."""
+"""The verbs of the command line that work on the corpus: verify, convert, pack."""
 
 import argparse
 from collections.abc import Callable, Iterator
@@ -59,21 +59,19 @@ def _convert(args: argparse.Namespace) -> int:
 
     read = _READERS[args.format]
     splits = ("train", "validation") if args.split == "auto" else (args.split,)
-    counts: dict[str, int] = dict.fromkeys(splits, 0)
-    if args.split == "auto":
-        counts |= _count_splits(read(args), split_of)
-    if not any(counts.values()) and args.split == "auto":
+    if args.split == "auto" and next(read(args), None) is None:
         raise ValueError(f"{args.sources}: expected episodes, found none")
     for split in splits:
-        if args.split == "auto" and not counts[split]:
-            print(f"{args.config}/{split}: no episodes fall here")
-            continue
 
         def chosen(split: str = split) -> "Iterator[Episode]":
             for episode in read(args):
                 if args.split != "auto" or _split(episode, split_of) == split:
                     yield episode
 
+        # Reads up to the first that falls here: all of them only where none does.
+        if args.split == "auto" and next(chosen(), None) is None:
+            print(f"{args.config}/{split}: no episodes fall here")
+            continue
         report = write_corpus(
             chosen,
             args.out,
@@ -87,13 +85,6 @@ def _convert(args: argparse.Namespace) -> int:
         print(report)
     print(f"card: {write_card(args.out)}")
     return 0
-
-
-def _count_splits(episodes: "Iterator[Episode]", split_of: Callable[..., str]) -> dict[str, int]:
-    counts = {"train": 0, "validation": 0}
-    for episode in episodes:
-        counts[_split(episode, split_of)] += 1
-    return counts
 
 
 def _split(episode: "Episode", split_of: Callable[..., str]) -> str:

@@ -105,7 +105,7 @@ class WindowNetwork:
 
     Args:
         models: one copy of the model a device, all with the same weights.
-        length: frames in a window; the model's own by default.
+        length: frames in a window.
         overlap: frames that consecutive windows share.
         batch_size: windows that go through the aggregator at once.
 
@@ -115,14 +115,14 @@ class WindowNetwork:
     """
 
     def __init__(
-        self, models: Sequence[MintModel], length: int | None, overlap: int, batch_size: int
+        self, models: Sequence[MintModel], length: int, overlap: int, batch_size: int
     ) -> None:
         if not models:
             raise ValueError("models: expected at least one, got none")
         if batch_size < 1:
             raise ValueError(f"batch_size: expected at least 1 window, got {batch_size}")
         self.models = models
-        self.length = models[0].config.window if length is None else length
+        self.length = length
         self.overlap = overlap
         self.batch_size = batch_size
         WindowPlanner(self.length, overlap)  # complains about sizes at once

@@ -10,7 +10,7 @@ from transformers.pipelines.base import Pipeline, PipelineRegistry
 from transformers.utils import logging
 
 from mint_hub.inference.devices import available_device
-from mint_hub.inference.runner import MintRunner, RunSettings
+from mint_hub.inference.runner import TASK, MintRunner, RunSettings
 from mint_hub.inference.video_input import key_from_name
 from mint_hub.loaders.schema import Episode
 from mint_hub.model.frames_mint import is_decoded
@@ -19,8 +19,6 @@ from mint_hub.model.processing_mint import MintProcessor
 from mint_hub.model.saving_mint import SavesCode
 
 logger = logging.get_logger(__name__)
-
-TASK = "egocentric-hands"
 
 NO_DEFAULT = (
     f'pipeline("{TASK}") needs a model: no default checkpoint is embedded in this version of '

@@ -42,6 +42,9 @@ from mint_hub.windows import WINDOW_OVERLAP
 
 Float = NDArray[np.float64]
 
+TASK = "egocentric-hands"
+"""The name that transformers knows this by."""
+
 
 @dataclass(frozen=True)
 class RunSettings:
@@ -89,8 +92,8 @@ class RunSettings:
             if getattr(self, name) not in values:
                 raise ValueError(f"{name}: expected one of {values}, got {getattr(self, name)!r}")
 
-    def resolved(self, model_window: int) -> "RunSettings":
-        """The same with window and overlap as numbers, for a model of this window.
+    def cut(self, model_window: int) -> tuple[int, int]:
+        """Window and overlap in frames, for a model of this window.
 
         Raises:
             ValueError: an overlap that is no shorter than the window.
@@ -104,6 +107,11 @@ class RunSettings:
             raise ValueError(
                 f"overlap: expected fewer frames than the window's {window}, got {overlap}"
             )
+        return window, overlap
+
+    def resolved(self, model_window: int) -> "RunSettings":
+        """The same with window and overlap as numbers; errors as of `cut`."""
+        window, overlap = self.cut(model_window)
         return replace(self, window=window, overlap=overlap)
 
 
@@ -185,9 +193,8 @@ class MintRunner:
         settings = (settings or RunSettings()).resolved(self.models[0].config.window)
         if camera_poses is not None:
             check_poses(camera_poses)
-        network = WindowNetwork(
-            self.models, settings.window, settings.overlap or 1, settings.batch_size
-        )
+        window, overlap = settings.cut(self.models[0].config.window)
+        network = WindowNetwork(self.models, window, overlap, settings.batch_size)
         with VideoInput.open(video, settings.fps, settings.on_error) as source:
             known = None
             if camera is not None:
@@ -290,7 +297,7 @@ class MintRunner:
             "hand_model": self.hand_model.name,
             "warnings": [*warnings, *source.warnings],
             "provenance": {
-                "task": "egocentric-hands",
+                "task": TASK,
                 "mint_hub": __version__,
                 "model": str(config._name_or_path) or "in memory",  # pyright: ignore
                 "revision": getattr(config, "_commit_hash", None),
