@@ -48,9 +48,13 @@ def video(
     prepare: Callable[[VideoStream], None] | None = None,
     gop: int = 10,
 ) -> Path:
-    """Write a video, at a constant rate or with the given presentation times (milliseconds)."""
+    """Write a video, at a constant rate or with the given presentation times (milliseconds).
+
+    Without x264's macroblock tree, which now and then gives other bytes for the same pictures.
+    """
+    steady = {"x264-params": "mbtree=0"} if codec == "libx264" else {}
     with av.open(str(path), "w", options=container_options or {}) as container:
-        stream = container.add_stream(codec, rate=rate, options=options or {})
+        stream = container.add_stream(codec, rate=rate, options={**steady, **(options or {})})
         stream.height, stream.width = size_hw
         stream.pix_fmt = pix_fmt
         stream.codec_context.gop_size = gop
