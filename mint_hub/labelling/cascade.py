@@ -11,13 +11,13 @@ import hashlib
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
 from mint_hub.labelling import record_files
 from mint_hub.labelling.records import Clip, Lost, Video
-from mint_hub.labelling.stage import ClipStage, NotReadyError, Outcome, Stage, VideoStage
+from mint_hub.labelling.stage import ClipStage, NotReadyError, Outcome, Stage, VideoStage, plain
 
 RecordT = TypeVar("RecordT", Clip, Video)
 
@@ -85,7 +85,7 @@ class Cascade:
     def fingerprint(self, video: Video, position: int) -> str:
         """Everything that the result of the stage at ``position`` depends on, as a hash."""
         stages = [
-            [s.stage, s.backend, s.version, _plain(s.settings)] for s in self.stages[: position + 1]
+            [s.stage, s.backend, s.version, plain(s.settings)] for s in self.stages[: position + 1]
         ]
         stat = video.path.stat() if video.path.is_file() else None
         stamp = [str(video.path), stat and stat.st_size, stat and stat.st_mtime_ns]
@@ -192,10 +192,6 @@ def _timed(record: RecordT, stage: Stage, seconds: float) -> RecordT:
         return record
     newest = replace(record.reports[-1], seconds=round(seconds, 4))
     return replace(record, reports=(*record.reports[:-1], newest))
-
-
-def _plain(settings: Any) -> Any:
-    return json.loads(json.dumps(asdict(settings), default=str))
 
 
 def _reason(error: Exception) -> str:

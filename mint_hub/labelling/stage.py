@@ -6,9 +6,10 @@ once. Settings are a frozen dataclass of plain values; stages are made from sett
 no other state between calls than workers they may have started (`close` ends those).
 """
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Protocol, runtime_checkable
 
 from mint_hub.labelling.records import Clip, Lost, StageReport, Video
 
@@ -39,25 +40,41 @@ class Outcome:
 
 
 class Stage(Protocol):
-    """What every backend declares.
+    """What every backend declares; class attributes will do.
 
-    Attributes:
-        stage: its place in the cascade: "normalise", "detect", "filter", "intrinsics",
-            "undistort", "depth", "camera", "hands", "stitch", "scale", "clean", "describe",
-            "accept".
-        backend: its name there.
-        version: goes up when results change.
-        needs, gives: fields of `Clip` read and written.
-        resources: of one worker.
-
+    Places in the cascade are "normalise", "detect", "filter", "intrinsics", "undistort", "depth",
+    "camera", "hands", "stitch", "scale", "clean", "describe" and "accept".
     """
 
-    stage: ClassVar[str]
-    backend: ClassVar[str]
-    version: ClassVar[str]
-    needs: ClassVar[tuple[str, ...]]
-    gives: ClassVar[tuple[str, ...]]
-    resources: ClassVar[Resources]
+    @property
+    def stage(self) -> str:
+        """Its place in the cascade."""
+        ...
+
+    @property
+    def backend(self) -> str:
+        """Its name there."""
+        ...
+
+    @property
+    def version(self) -> str:
+        """Goes up when results change."""
+        ...
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Fields of `Clip` it reads."""
+        ...
+
+    @property
+    def gives(self) -> tuple[str, ...]:
+        """Fields of `Clip` it writes."""
+        ...
+
+    @property
+    def resources(self) -> Resources:
+        """What one worker of it occupies."""
+        ...
 
     @property
     def settings(self) -> Any:
@@ -93,6 +110,18 @@ class VideoStage(Stage, Protocol):
 def reported(clip: Clip, report: StageReport, **changes: Any) -> Clip:
     """Return the clip with ``changes`` and the report added."""
     return replace(clip, **changes, reports=(*clip.reports, report))
+
+
+def plain(settings: Any) -> dict[str, Any]:
+    """Return a settings dataclass as plain JSON."""
+    return json.loads(json.dumps(asdict(settings), default=str))
+
+
+def report_of(stage: Stage, **numbers: Any) -> StageReport:
+    """Return the report of a stage that measured these numbers; its time is added later."""
+    return StageReport(
+        stage.stage, stage.backend, stage.version, plain(stage.settings), numbers=numbers
+    )
 
 
 def require(stage: Stage, clip: Clip) -> None:
