@@ -219,7 +219,8 @@ def umeyama(
         target: (..., N, 3) metres, same shape as ``source`` or broadcasting against it.
         with_scale: fit the scale, else it is 1.
         weights: (..., N), not negative, or None.
-        check: validate values; without it degenerate input gives unspecified finite rotations.
+        check: validate values; without it degenerate input gives unspecified finite rotations, and
+            source points that coincide exactly the scale 0, if fitted: the target's mean.
 
     Raises:
         ValueError: wrong shapes; with ``check``, non-finite input, or source or target points that
@@ -228,7 +229,7 @@ def umeyama(
     """
     require_shape("source", source, (3,))
     require_shape("target", target, (3,))
-    namespace(source, target, weights)
+    xp = namespace(source, target, weights)
     if len(source.shape) < 2 or source.shape[-2] != target.shape[-2] or source.shape[-2] < 1:
         raise ValueError(
             f"source, target: expected (..., N, 3) with the same N >= 1, got {tuple(source.shape)} "
@@ -252,7 +253,8 @@ def umeyama(
         _require_spread("target", (w * b * b).sum(axis=(-1, -2)), target)
     covariance = transpose(w * b) @ a
     R: Any = nearest_rotation(covariance, check=False)
-    scale = (R * covariance).sum(axis=(-1, -2)) / variance if with_scale else 0 * variance + 1
+    spread = xp.where(variance > 0, variance, 1.0 + 0 * variance)
+    scale = (R * covariance).sum(axis=(-1, -2)) / spread if with_scale else 0 * variance + 1
     translation = mean_target - scale[..., None] * matvec(R, mean_source)
     return Similarity(scale, R, translation)
 
