@@ -24,6 +24,7 @@ Source: VITRA (arXiv 2510.21571) and its released code.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -45,6 +46,13 @@ STATE_SIZE: Final = len(SIDES) * HAND_STATE_SIZE
 PADDED_ACTION_SIZE: Final = 192
 PADDED_STATE_SIZE: Final = PADDED_ACTION_SIZE + len(SIDES) * hands.NUM_SHAPE_PARAMS
 CHUNK_LENGTH: Final = 16
+DEFINITIONS: Final[tuple[tuple[Relative, Fingers], ...]] = (
+    ("step", "absolute"),
+    ("anchor", "absolute"),
+    ("step", "relative"),
+    ("anchor", "relative"),
+)
+"""What an action may be; the first is VITRA's."""
 
 GIMBAL_COSINE: Final = 1e-7
 """Cosine of the middle angle below which the first and third turn about one axis: the third is
@@ -140,6 +148,27 @@ def window_actions(
         ValueError: shapes that disagree, or windows of fewer than 2 frames.
 
     """
+    flat, index = _window_frames(T_camera_from_world, hand_state, presence)
+    return _chunks(flat, index, np.ones(index.shape, bool), relative, fingers, dtype)
+
+
+def window_definitions(
+    T_camera_from_world: NDArray[Any],
+    hand_state: NDArray[Any],
+    presence: NDArray[np.bool_],
+    *,
+    dtype: DTypeLike = np.float32,
+) -> dict[tuple[Relative, Fingers], ActionChunks]:
+    """Return what ``window_actions`` returns in each of DEFINITIONS, computed together."""
+    flat, index = _window_frames(T_camera_from_world, hand_state, presence)
+    inside = np.ones(index.shape, bool)
+    return {d: _chunks(flat, index, inside, *d, dtype) for d in DEFINITIONS}
+
+
+def _window_frames(
+    T_camera_from_world: NDArray[Any], hand_state: NDArray[Any], presence: NDArray[np.bool_]
+) -> "tuple[_Frames, NDArray[np.int64]]":
+    """The frames of all windows, and which of them each window (N, L + 1) is."""
     count, frames = presence.shape[:2] if presence.ndim == 3 else (0, 0)
     for name, array, tail in (
         ("T_camera_from_world", T_camera_from_world, (4, 4)),
@@ -154,8 +183,7 @@ def window_actions(
         hand_state.reshape(-1, 2, hands.HAND_STATE_SIZE),
         presence.reshape(-1, 2),
     )
-    index = np.arange(count * frames).reshape(count, frames)
-    return _chunks(flat, index, np.ones(index.shape, bool), relative, fingers, dtype)
+    return flat, np.arange(count * frames).reshape(count, frames)
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,13 +273,12 @@ def matrix_to_euler_xyz(R: NDArray[Any]) -> NDArray[Any]:
     """
     cosine = np.hypot(R[..., 0, 0], R[..., 1, 0])
     locked = cosine < GIMBAL_COSINE
-    a = np.where(
-        locked,
-        np.arctan2(-R[..., 1, 2], R[..., 1, 1]),
-        np.arctan2(R[..., 2, 1], R[..., 2, 2]),
-    )
+    a = np.arctan2(R[..., 2, 1], R[..., 2, 2])
     b = np.arctan2(-R[..., 2, 0], cosine)
-    c = np.where(locked, 0.0, np.arctan2(R[..., 1, 0], R[..., 0, 0]))
+    c = np.arctan2(R[..., 1, 0], R[..., 0, 0])
+    if locked.any():
+        a = np.where(locked, np.arctan2(-R[..., 1, 2], R[..., 1, 1]), a)
+        c = np.where(locked, 0.0, c)
     return np.stack([a, b, c], axis=-1)
 
 
@@ -276,6 +303,11 @@ class _Frames:
     joints: Float  # (F, 2, 15, 3, 3) as stored
     shape: Float  # (F, 2, 10)
     presence: NDArray[np.bool_]  # (F, 2)
+
+    @cached_property
+    def angles(self) -> Float:
+        """Finger angles (F, 2, 45)."""
+        return _finger_angles(self.joints)
 
     @classmethod
     def of(
@@ -310,9 +342,8 @@ def _chunks(
     R = camera[:, None, None, :3, :3]
     step = (R @ (frames.place[after] - frames.place[before])[..., None])[..., 0]
     turn = frames.turn[after] @ frames.turn[before].swapaxes(-1, -2)
-    pose_angles = _finger_angles(frames.joints)
     if fingers == "absolute":
-        angles = pose_angles[after]
+        angles = frames.angles[after]
     else:
         turned = frames.joints[after] @ frames.joints[before].swapaxes(-1, -2)
         angles = _finger_angles(turned)
@@ -326,7 +357,7 @@ def _chunks(
             (camera[:, None, :3, :3] @ frames.place[first][..., None])[..., 0]
             + camera[:, None, :3, 3],
             matrix_to_euler_xyz(camera[:, None, :3, :3] @ frames.turn[first]),
-            pose_angles[first],
+            frames.angles[first],
             frames.shape[first],
         ],
         axis=-1,

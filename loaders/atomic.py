@@ -1,6 +1,8 @@
 """Files that appear whole or not at all."""
 
+import glob
 import os
+import shutil
 import tempfile
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -20,3 +22,10 @@ def replacing(path: str | os.PathLike[str]) -> Generator[Path]:
         temporary = Path(folder) / path.name
         yield temporary
         os.replace(temporary, path)
+
+
+def clear_left_over(path: str | os.PathLike[str]) -> None:
+    """Remove what a process that was killed within ``replacing(path)`` left beside ``path``."""
+    path = Path(path)
+    for folder in path.parent.glob(f".{glob.escape(path.name)}.*/"):
+        shutil.rmtree(folder)

@@ -1,7 +1,10 @@
 """Pictures for an episode, from the user's own copy of its video.
 
 A frame of the episode shows the stored frame nearest in presentation time. Which file that is, and
-whether it is the video that was labelled, is checked before a picture comes out.
+whether it is the video that was labelled, is checked before a picture comes out. What is known of
+the video is in the episode's ``meta``, where the converters put what their sources tell:
+``native_fps``, ``video_start_sec``, ``video_duration_s``, ``undistorted``, ``lens`` and
+``image_turn_clockwise_deg``; see `resolvers.VideoReference`.
 """
 
 from collections.abc import Collection, Mapping
@@ -83,6 +86,7 @@ class VideoAttachment:
     Attributes:
         reference, source, info: what was looked for, the file, and what it says of itself.
         rectified: whether a lens is undone.
+        turn_clockwise_deg: how pictures are turned afterwards.
         offset_s: from the clock of the labels to the container's.
 
     Raises:
@@ -115,6 +119,7 @@ class VideoAttachment:
         self.offset_s = 0.0 if start_s is None else self.info.start_time_s - start_s
         spec = self.reference.lens if isinstance(lens, str) and lens == "meta" else lens
         self.rectified = spec is not None
+        self.turn_clockwise_deg = self.reference.turn_clockwise_deg
         self._check(frozenset(ignore), spec is None and lens is not None)
         self._warp = _warp(spec, self.info.image_size_hw)
 
@@ -150,10 +155,15 @@ class VideoAttachment:
         size = self.reference.image_size_hw if size_hw is None else checked_size(size_hw)
         times = self.reference.timestamps_s[start : start + length] + self.offset_s
         with self._cache().reader(self.source) as reader:
-            images, source_s = reader.at(times, size if self._warp is None else None)
+            turned = self.turn_clockwise_deg in (90, 270)
+            before = (size[1], size[0]) if turned else size
+            images, source_s = reader.at(times, before if self._warp is None else None)
         self._check_times(start, times, source_s)
         if self._warp is not None:
-            images = _warped(images, self._warp, size)
+            images = _warped(images, self._warp, before)
+        if self.turn_clockwise_deg:
+            quarters = -self.turn_clockwise_deg // 90
+            images = np.ascontiguousarray(np.rot90(images, quarters, axes=(1, 2)))
         return VideoWindow(images, times, source_s)
 
     @overload
@@ -193,7 +203,8 @@ class VideoAttachment:
         """Refuse a file that is not the labelled video."""
         video, info = self.reference, self.info
         if "size" not in ignore:
-            (height, width), (h, w) = video.image_size_hw, info.image_size_hw
+            height, width = video.image_size_hw
+            h, w = info.image_size_hw[:: -1 if self.turn_clockwise_deg in (90, 270) else 1]
             if abs(w * height / (h * width) - 1) > ASPECT_TOLERANCE:
                 want = f"the aspect ratio of (height, width) {video.image_size_hw}"
                 self._refuse("size", want, str(info.image_size_hw))

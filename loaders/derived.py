@@ -291,16 +291,16 @@ def schema_table(
             (f"`{f.name}`", f"{f.kind} or null" if f.optional else f.kind, f.unit, f.description)
             for f in META_FIELDS
         ]
-        return _markdown(header, rows)
+        return markdown_table(header, rows)
     if part == "episode":
         header = ("field", "dtype", "shape", "unit", "frame", "content")
         arrays = [
             (f"`{f.name}`", f.dtype, _shape(f.shape), f.unit, f.frame, f.description)
             for f in ARRAY_FIELDS
         ]
-        return _markdown(header, arrays)
+        return markdown_table(header, arrays)
     header = ("member", "dtype", "column", "numbers", "unit", "frame", "content")
-    return _markdown(header, _member_rows(format))
+    return markdown_table(header, _member_rows(format))
 
 
 def _member_rows(format: Format | None) -> list[tuple[str, ...]]:
@@ -323,6 +323,14 @@ def _shape(sizes: Iterable[int | str]) -> str:
     return f"({', '.join(named)}{',' if len(named) == 1 else ''})"
 
 
-def _markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a markdown table, a line a row; bars and line breaks within cells are made harmless.
+
+    >>> print(markdown_table(("side", "frames"), [("left", "90")]), end="")
+    | side | frames |
+    | --- | --- |
+    | left | 90 |
+    """
     lines = [header, ["---"] * len(header), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    cells = ([" ".join(cell.replace("|", "\\|").split()) for cell in line] for line in lines)
+    return "".join(f"| {' | '.join(line)} |\n" for line in cells)

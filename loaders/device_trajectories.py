@@ -116,7 +116,9 @@ def episode_from_trajectory(
         image_size_hw: of the video.
         time_offset_s: device time = video time + this.
         max_gap_s: see ``camera_at``.
-        meta: added to the episode's.
+        meta: added to the episode's; what is known of the video (``source``, ``uid``,
+            ``native_fps``, ``video_duration_s``, ``lens``) is where `attach` looks for it. Times
+            are the container's, so there is no ``video_start_sec``.
 
     Raises:
         ValueError: see ``camera_at``; also what ``Episode`` refuses.

@@ -23,13 +23,44 @@ SUFFIX: Final = ".npz"
 
 def write_episode(values: Mapping[str, Any], path: Path) -> Path:
     """Write what ``Episode.to_dict`` returns; the file appears whole or not at all."""
+    return write_arrays(
+        {
+            name: np.asarray(json.dumps(value, sort_keys=True) if name in JSON_MEMBERS else value)
+            for name, value in values.items()
+        },
+        path,
+    )
+
+
+def write_arrays(arrays: Mapping[str, NDArray[Any]], path: Path) -> Path:
+    """Write arrays by name as one ``.npz``; it appears whole or not at all.
+
+    Raises:
+        EpisodeError: the path does not end in .npz.
+
+    """
     if path.suffix != SUFFIX:
         raise EpisodeError(f"{path}: expected a name that ends in {SUFFIX}")
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for name, value in values.items():
-            text = json.dumps(value, sort_keys=True) if name in JSON_MEMBERS else value
-            _write_member(archive, name, np.asarray(text))
+        for name, array in arrays.items():
+            _write_member(archive, name, array)
     return path
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an ``.npz`` by name, every byte of them checked.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        EpisodeError: not a whole npz file, or a member that is no plain array.
+
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = ((member, member.removesuffix(".npy")) for member in archive.namelist())
+            return {name: _read_member(archive, member, name) for member, name in names}
+    except zipfile.BadZipFile as error:
+        raise EpisodeError(f"expected a whole npz file, got: {error}") from error
 
 
 def read_episode(path: Path) -> dict[str, Any]:
@@ -40,14 +71,7 @@ def read_episode(path: Path) -> dict[str, Any]:
         EpisodeError: not a whole npz file, or a member that is no plain array or no JSON.
 
     """
-    values: dict[str, Any] = {}
-    try:
-        with zipfile.ZipFile(path) as archive:
-            for member in archive.namelist():
-                name = member.removesuffix(".npy")
-                values[name] = _read_member(archive, member, name)
-    except zipfile.BadZipFile as error:
-        raise EpisodeError(f"expected a whole npz file, got: {error}") from error
+    values: dict[str, Any] = dict(read_arrays(path))
     for name in JSON_MEMBERS:
         try:
             values[name] = json.loads(str(values[name]))

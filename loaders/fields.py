@@ -172,6 +172,8 @@ def placed(error: EpisodeError, where: str, key: str = "") -> EpisodeError:
 
 def integer(value: object, place: str) -> int:
     """Return a whole number of any integer type as int; bools and floats are refused."""
+    if type(value) is int:
+        return value
     if isinstance(value, bool | np.bool_) or not isinstance(value, SupportsIndex):
         raise EpisodeError(f"{place}: expected a whole number, got {value!r}")
     return operator.index(value)
@@ -257,10 +259,27 @@ def check_values(arrays: Mapping[str, NDArray[Any]]) -> None:
             f"filled: expected only hands that are present, got an absent one at frame {frame}, "
             f"{SIDES[hand]}"
         )
-    state = hands.unpack(arrays["hand_state"])
-    rot6d = np.concatenate(
-        [state.orientation_rot6d_rows[..., None, :], state.joint_rot6d_rows], axis=-2
-    )
+    _check_rotations(arrays["hand_state"])
+
+
+def row_products(rot6d: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Return a.a, b.b and a.b, each (N,), of the rows a and b of 6D rotations (N, 6).
+
+    One number at a time over all rotations: several times faster than over rows of three.
+    """
+    a0, a1, a2, b0, b1, b2 = np.ascontiguousarray(rot6d.T)
+    aa, bb = a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2
+    return aa, bb, a0 * b0 + a1 * b1 + a2 * b2
+
+
+def _check_rotations(hand_state: NDArray[np.float32]) -> None:
+    """Refuse 6D rotations whose rows span no plane."""
+    rotations = hand_state[..., hands.ORIENTATION.start : hands.JOINT_ROTATIONS.stop]
+    with np.errstate(over="ignore", invalid="ignore"):
+        aa, bb, ab = row_products(rotations.reshape(-1, 6))
+        if (aa * bb - ab * ab > 0.25).all():  # the squared area, which round-off cannot hide here
+            return
+    rot6d = rotations.reshape(*hand_state.shape[:-1], -1, 6)
     area = np.linalg.norm(np.cross(rot6d[..., :3], rot6d[..., 3:]), axis=-1)
     if (bad := np.argwhere(area < 1e-6)).size:
         frame, hand, joint = (int(i) for i in bad[0])
@@ -276,13 +295,16 @@ def _check_poses(T: NDArray[np.float64]) -> None:
         row = T[bad[0], 3].tolist()
         raise EpisodeError(f"{name}: expected last row [0, 0, 0, 1], got {row} at frame {bad[0]}")
     R = T[:, :3, :3]
-    error = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-1, -2))
-    if (bad := np.flatnonzero(error > ROTATION_TOLERANCE)).size:
-        k = int(bad[0])
+    off = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3))
+    if not off.max() <= ROTATION_TOLERANCE:
+        error = off.max(axis=(-1, -2))
+        k = int(np.flatnonzero(error > ROTATION_TOLERANCE)[0])
         raise EpisodeError(
             f"{name}: expected R Rᵀ = I, got an error of {error[k]:.2g} at frame {k}"
         )
-    if (bad := np.flatnonzero(np.linalg.det(R) < 0)).size:
+    a, b, c = (R[:, row].T for row in range(3))  # each (3, T)
+    turned = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    if (bad := np.flatnonzero(sum(x * y for x, y in zip(turned, c, strict=True)) < 0)).size:
         raise EpisodeError(f"{name}: expected a rotation, got a reflection at frame {bad[0]}")
 
 

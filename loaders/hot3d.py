@@ -8,8 +8,10 @@ their exact nanoseconds.
 
 A hand is 15 coefficients of MANO's PCA basis, which lives in MANO's files, as does the rest wrist
 J0 that leads from the stored MANO ``transl`` to the wrist. With the user's MANO files the episode
-has the full hand states. Without them no joint can be known, not even the wrist: every hand is
-absent, ``meta["joints_available"]`` is false, and ``meta["hot3d"]`` keeps what was annotated.
+has the full hand states. Without them no joint can be known, not even the wrist, and a presence
+without a hand state would be a lie: every hand is absent and ``meta["quality"]["hands"]`` is
+HANDS_UNAVAILABLE. What was annotated stays in the sequence, to be read by ``hot3d_hands`` in the
+episode's frames and saved as a file of its own.
 
 The images are fisheye, Aria's lie on their side. The episode is that of the rectified picture
 (``geometry.lenses.rectification(lens)`` with the lens of ``meta["lens"]``) turned upright by
@@ -18,7 +20,7 @@ The images are fisheye, Aria's lie on their side. The episode is that of the rec
 
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final
@@ -46,6 +48,9 @@ ARIA_STREAMS: Final = {
     "1201-2": ("camera-slam-right", (480, 640)),
 }
 """Label in the calibration, and (height, width) of the raw images, of HOT3D's Aria streams."""
+
+HANDS_UNAVAILABLE: Final = "unavailable: needs MANO"
+"""``meta["quality"]["hands"]`` where hands are annotated that only MANO's files can read."""
 
 HEADSET: Final = "headset_trajectory.csv"
 HANDS: Final = "mano_hand_pose_trajectory.jsonl"
@@ -76,9 +81,7 @@ def from_hot3d(
     Returns:
         The frames whose headset pose is available, at times from the first of them. World and
         lengths are the motion capture's. With ``mano_dir``, a hand is present where its pose is
-        annotated; without it see the module. ``meta["hot3d"]`` has, for each frame of the whole
-        episode (it is not cut by ``window``), left hand first and null where not annotated:
-        ``pca``, ``transl_world_m`` (MANO's transl), ``orientation_world_quat_xyzw``, ``betas``.
+        annotated; without it see the module.
 
     Raises:
         FileNotFoundError: a file of the sequence, or MANO_RIGHT.pkl, is missing.
@@ -86,25 +89,16 @@ def from_hot3d(
 
     """
     folder = Path(folder)
-    if not (folder / HEADSET).is_file():
-        raise FileNotFoundError(f"{folder}: expected a HOT3D sequence with {HEADSET}, found none")
-    masks = folder / "masks"
-    stamps, has_pose = _mask(masks / f"{HEADSET_MASK}.csv", stream)
-    stamps = stamps[has_pose]
-    if not len(stamps):
-        raise ValueError(f"{folder}: stream {stream}: expected headset poses, got none available")
+    every, stamps = _stamps(folder, stream)
     camera = _camera(folder, stream, upright)
     T_world_from_device = _headset_poses(folder / HEADSET, stamps)
     T_camera_from_world = rigid.inverse(T_world_from_device @ camera.T_device_from_camera)
-    annotated = Hot3DHands.read(folder / HANDS, stamps)
-    if (masks / f"{HANDS_MASK}.csv").is_file():
-        annotated = annotated.where(_at(masks / f"{HANDS_MASK}.csv", stream, stamps))
+    annotated = _annotated(folder, stream, stamps)
     state = np.asarray(hands.absent((len(stamps), 2)), np.float64)
     presence = np.zeros((len(stamps), 2), bool)
     if mano_dir is not None:
         state, presence = annotated.states(T_camera_from_world, Path(mano_dir)), annotated.there
     about = _about(folder)
-    name = f"hot3d-{about['headset']}-{about['recording_name']}-{stream}".lower()
     meta = {
         "source": "hot3d",
         "uid": about["recording_name"],
@@ -112,24 +106,21 @@ def from_hot3d(
         "stream": stream,
         "scale_status": "metric, motion capture",
         "shape_space": "mano",
-        "source_timestamps_s": (stamps * 1e-9).tolist(),
+        "source_timestamps_s": (stamps / 1e9).tolist(),
+        "video_start_sec": int(every[0] - stamps[0]) / 1e9,
+        "undistorted": True,
         **camera.facts,
-        "joints_available": mano_dir is not None,
         "provenance": {"annotation": "hot3d", "first_timestamp_ns": int(stamps[0])},
-        "warnings": [] if mano_dir is not None else [_unavailable(annotated.there)],
-        "hot3d": {
-            **annotated.to_json(),
-            **{
-                name: _at(path, stream, stamps).tolist()
-                for name in FRAME_MASKS
-                if (path := masks / f"{name}.csv").is_file()
-            },
-        },
+        "warnings": [],
     }
-    if len(stamps) > 1:
-        meta["fps"] = round(1e9 / float(np.median(np.diff(stamps))), 2)
+    if mano_dir is None:
+        meta["quality"] = {"hands": HANDS_UNAVAILABLE}
+        meta["warnings"] = [_unavailable(annotated.there)]
+    for name, times in (("fps", stamps), ("native_fps", every)):
+        if len(times) > 1:
+            meta[name] = round(1e9 / float(np.median(np.diff(times))), 2)
     return Episode(
-        key=key or re.sub(r"[^a-z0-9_-]", "-", name),
+        key=key or hot3d_key(folder, stream),
         timestamps_s=(stamps - stamps[0]) * 1e-9,
         T_camera_from_world=T_camera_from_world,
         fov_vh_rad=np.tile(camera.fov_vh_rad, (len(stamps), 1)).astype(np.float32),
@@ -138,6 +129,47 @@ def from_hot3d(
         image_size_hw=camera.image_size_hw,
         meta=meta,
     )
+
+
+def hot3d_hands(folder: str | PathLike[str], stream: str = "214-1") -> Hot3DHands:
+    """Read what a sequence says of both hands, in the frames of ``from_hot3d(folder, stream)``.
+
+    Nothing is made of the numbers, so no MANO files are needed. Of an episode that was cut,
+    ``.window(episode.meta.get("window_start", 0), episode.num_frames)`` are the same frames.
+
+    Raises:
+        FileNotFoundError: a file of the sequence is missing.
+        ValueError: names file, line, expected and got.
+
+    """
+    _, stamps = _stamps(Path(folder), stream)
+    return _annotated(Path(folder), stream, stamps)
+
+
+def hot3d_key(folder: str | PathLike[str], stream: str = "214-1") -> str:
+    """Return the key of an episode that is given none: of headset, recording and stream."""
+    about = _about(Path(folder))
+    name = f"hot3d-{about['headset']}-{about['recording_name']}-{stream}".lower()
+    return re.sub(r"[^a-z0-9_-]", "-", name)
+
+
+def _stamps(folder: Path, stream: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Times (ns) of all frames of a stream, and of those whose headset pose is available."""
+    if not (folder / HEADSET).is_file():
+        raise FileNotFoundError(f"{folder}: expected a HOT3D sequence with {HEADSET}, found none")
+    every, has_pose = _mask(folder / "masks" / f"{HEADSET_MASK}.csv", stream)
+    if not has_pose.any():
+        raise ValueError(f"{folder}: stream {stream}: expected headset poses, got none available")
+    return every, every[has_pose]
+
+
+def _annotated(folder: Path, stream: str, stamps: NDArray[np.int64]) -> Hot3DHands:
+    annotated, masks = Hot3DHands.read(folder / HANDS, stamps), folder / "masks"
+    if (masks / f"{HANDS_MASK}.csv").is_file():
+        annotated = annotated.where(_at(masks / f"{HANDS_MASK}.csv", stream, stamps))
+    paths = {name: masks / f"{name}.csv" for name in FRAME_MASKS}
+    said = {name: _at(path, stream, stamps) for name, path in paths.items() if path.is_file()}
+    return replace(annotated, masks=said)
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,5 +301,6 @@ def _unavailable(annotated: NDArray[np.bool_]) -> str:
     left, right = (int(n) for n in annotated.sum(axis=0))
     return (
         f"joints unavailable: hands ({left} left, {right} right frames) are coefficients of MANO's "
-        "PCA basis, and the wrist needs MANO's rest wrist; give mano_dir. meta['hot3d'] keeps them"
+        "PCA basis, and the wrist needs MANO's rest wrist; give mano_dir, or read them as they are "
+        "with hot3d_hands"
     )

@@ -4,12 +4,16 @@ A line is a time and, for hand "0" (left) and "1" (right), 15 coefficients of MA
 wrist's orientation and MANO's ``transl`` in the world, and 10 shape numbers. Joint rotations are
 ``hands_mean + coefficients @ hands_components`` as rotation vectors (MANO, Romero et al. 2017,
 eq. 6), each side with its own file's basis.
+
+Where MANO's files are missing, these numbers are all that is known of the hands. They go to a file
+of their own (``save``), never into an episode's JSON: no reader could use them there.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
+from os import PathLike
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +25,8 @@ from mint_hub.geometry.hand_model import HandModel
 from mint_hub.geometry.mano_files import find_mano_files
 from mint_hub.geometry.plain_pickle import load_plain_pickle
 from mint_hub.geometry.rotations import quat_xyzw_to_matrix, rotvec_to_matrix
+from mint_hub.loaders.episode_file import read_arrays, write_arrays
+from mint_hub.loaders.fields import EpisodeError, require_window
 from mint_hub.loaders.trajectory_files import json_lines, pose_from_numbers
 
 Float = NDArray[np.float64]
@@ -28,13 +34,31 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Hot3DHands:
-    """What is annotated of both hands (left, right) at T frames, in the world."""
+    """What is annotated of both hands (left, right) at T frames, in the world.
 
-    there: NDArray[np.bool_]  # (T, 2)
-    pca: Float  # (T, 2, C)
-    transl: Float  # (T, 2, 3) MANO's, metres
-    quat_xyzw: Float  # (T, 2, 4)
-    betas: Float  # (T, 2, 10)
+    Attributes:
+        timestamps_ns: (T,) int64, the recording's own clock.
+        there: (T, 2) bool, whether a hand is annotated; where not, its numbers say nothing.
+        pca: (T, 2, C) coefficients of MANO's PCA basis, C = 15 in HOT3D.
+        transl: (T, 2, 3) MANO's transl, metres: not the wrist, which is the rest wrist J0 away.
+        quat_xyzw: (T, 2, 4) orientation of the wrist.
+        betas: (T, 2, 10) MANO's shape numbers.
+        masks: HOT3D's own masks of these frames by name (mask_...), each (T,) bool.
+
+    """
+
+    timestamps_ns: NDArray[np.int64]
+    there: NDArray[np.bool_]
+    pca: Float
+    transl: Float
+    quat_xyzw: Float
+    betas: Float
+    masks: dict[str, NDArray[np.bool_]] = field(default_factory=dict[str, NDArray[np.bool_]])
+
+    @property
+    def num_frames(self) -> int:
+        """T."""
+        return len(self.there)
 
     @classmethod
     def read(cls, path: Path, stamps: NDArray[np.int64]) -> "Hot3DHands":
@@ -65,6 +89,7 @@ class Hot3DHands:
                 ) from None
         count, size = len(stamps), len(found[0][3]) if found else 0
         hands_read = cls(
+            np.array(stamps, np.int64),
             np.zeros((count, 2), bool),
             np.zeros((count, 2, size)),
             np.zeros((count, 2, 3)),
@@ -80,8 +105,41 @@ class Hot3DHands:
 
     def where(self, frames: NDArray[np.bool_]) -> "Hot3DHands":
         """Only the frames (T,) that are available."""
-        there = self.there & frames[:, None]
-        return Hot3DHands(there, self.pca, self.transl, self.quat_xyzw, self.betas)
+        return replace(self, there=self.there & frames[:, None])
+
+    def window(self, start: int, length: int) -> "Hot3DHands":
+        """Return frames start .. start + length - 1.
+
+        Raises:
+            ValueError: the frames are not all there, or length < 1.
+
+        """
+        require_window(start, length, self.num_frames)
+        part = slice(start, start + length)
+        arrays = {name: getattr(self, name)[part] for name in _ARRAYS}
+        return Hot3DHands(**arrays, masks={name: m[part] for name, m in self.masks.items()})
+
+    def save(self, path: str | PathLike[str]) -> Path:
+        """Write one ``.npz`` of plain arrays, named as the attributes; equal hands, equal bytes."""
+        return write_arrays({n: getattr(self, n) for n in _ARRAYS} | self.masks, Path(path))
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> "Hot3DHands":
+        """Read what ``save`` wrote. Nothing is unpickled.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: not whole, or not such a file; names it.
+
+        """
+        try:
+            arrays = read_arrays(Path(path))
+        except EpisodeError as error:
+            raise EpisodeError(f"{path}: {error}") from None
+        masks = {name: arrays.pop(name) for name in list(arrays) if name.startswith("mask_")}
+        if sorted(arrays) != sorted(_ARRAYS):
+            raise EpisodeError(f"{path}: expected {', '.join(_ARRAYS)}, got {sorted(arrays)}")
+        return cls(**arrays, masks=masks)  # pyright: ignore[reportArgumentType]
 
     def states(self, T_camera_from_world: Float, mano_dir: Path) -> Float:
         """Hand states (T, 2, 109) in the camera frame; absent where not annotated.
@@ -111,21 +169,8 @@ class Hot3DHands:
             ).pack()
         return state
 
-    def to_json(self) -> dict[str, Any]:
-        """Lists for ``meta["hot3d"]``: null where a hand is not annotated."""
-        arrays = {
-            "pca": self.pca,
-            "transl_world_m": self.transl,
-            "orientation_world_quat_xyzw": self.quat_xyzw,
-            "betas": self.betas,
-        }
-        return {
-            name: [
-                [row if seen else None for row, seen in zip(rows, there, strict=True)]
-                for rows, there in zip(array.tolist(), self.there.tolist(), strict=True)
-            ]
-            for name, array in arrays.items()
-        }
+
+_ARRAYS: Final = tuple(f.name for f in fields(Hot3DHands) if f.name != "masks")
 
 
 def _check_hand(index: str, hand: Mapping[str, Any], num_coefficients: int) -> None:

@@ -111,8 +111,10 @@ class ShardSummary:
         return int(self.rows["num_frames"].sum())
 
 
-def summarise(path: Path, shard: int, names: Sequence[str]) -> ShardSummary:
+def summarise(path: Path, shard: int, names: Sequence[str], halvings: int = 0) -> ShardSummary:
     """Read a whole shard and check that every sample has exactly the members ``names``.
+
+    ``halvings`` says how few chunks of actions the statistics look at: see ``ActionStats``.
 
     Raises:
         CorpusError: the shard is cut or damaged, or a sample has other members.
@@ -120,7 +122,7 @@ def summarise(path: Path, shard: int, names: Sequence[str]) -> ShardSummary:
 
     """
     buffer, where = map_file(path), path.name
-    stats = CorpusStats()
+    stats = CorpusStats(halvings)
     rows: list[tuple[int, ...]] = []
     records: list[dict[str, Any]] = []
     for sample in samples_in(buffer, where):

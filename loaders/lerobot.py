@@ -1,5 +1,6 @@
 """LeRobot v3, both ways: ``from_lerobot`` reads Episodes, ``to_lerobot`` writes a root.
 
+``LeRobotSlices`` gives the same Episodes to ``write_corpus``, whose processes then read as well.
 The dialects are declared in ``lerobot_columns``; ``lerobot_codec`` turns their columns into arrays.
 """
 
@@ -10,6 +11,7 @@ from mint_hub.loaders.lerobot_read import (
     lerobot_episodes,
     lerobot_roots,
 )
+from mint_hub.loaders.lerobot_slices import LeRobotSlices
 from mint_hub.loaders.lerobot_write import LeRobotReport, to_lerobot
 
 __all__ = [
@@ -17,6 +19,7 @@ __all__ = [
     "Dialect",
     "LeRobotError",
     "LeRobotReport",
+    "LeRobotSlices",
     "from_lerobot",
     "lerobot_episodes",
     "lerobot_roots",

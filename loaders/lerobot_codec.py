@@ -51,18 +51,26 @@ def _decode_camera(columns: Mapping[str, NDArray[Any]]) -> Arrays:
     _require("cam_trans", np.isfinite(trans).all(-1), "finite numbers", trans)
     camera = camera_state.CameraState(trans, quat, fov)
     presence = columns["hand_kept"]
-    state = np.stack([np.concatenate(_parts(columns, side), axis=-1) for side in SIDES], axis=1)
+    state = np.empty((len(quat), len(SIDES), hands.HAND_STATE_SIZE), np.float32)
+    for hand, side in enumerate(SIDES):
+        for name, where in _CAMERA_PARTS.items():
+            state[:, hand, where] = columns[f"{side}_mano_{name}"]
+    state[~presence] = hands.absent()
     return {
         "T_camera_from_world": camera.T_camera_from_world(),
         "fov_vh_rad": fov,
-        "hand_state": np.where(presence[..., None], state, hands.absent()),
+        "hand_state": state,
         "presence": presence,
     }
 
 
-def _parts(columns: Mapping[str, NDArray[Any]], side: str) -> list[NDArray[Any]]:
-    names = (f"{side}_mano_{n}" for n in ("transl_cam", "orient6d", "pose6d", "betas"))
-    return [columns[name] for name in names]
+_CAMERA_PARTS: Final = {
+    "transl_cam": hands.TRANSLATION,
+    "orient6d": hands.ORIENTATION,
+    "pose6d": hands.JOINT_ROTATIONS,
+    "betas": hands.SHAPE,
+}
+"""Where each column of a hand lies in its state."""
 
 
 def _decode_world(columns: Mapping[str, NDArray[Any]]) -> Arrays:

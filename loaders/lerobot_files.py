@@ -6,7 +6,7 @@ bounded by one row group.
 
 import json
 import os
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final
@@ -55,8 +55,10 @@ class Root:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
+        place = f"{self.folder}/{relative}"
+        local = "file" in np.atleast_1d(self.filesystem.protocol)
         try:
-            source = self.filesystem.open(f"{self.folder}/{relative}", "rb")
+            source = pa.memory_map(place) if local else self.filesystem.open(place, "rb")
         except FileNotFoundError:
             raise LeRobotError(f"{self.name(relative)}: expected this file, got none") from None
         with source:
@@ -125,6 +127,22 @@ def open_root(root: str | os.PathLike[str], storage_options: dict[str, Any] | No
     return Root(address, filesystem, str(folder).rstrip("/"), info)
 
 
+def roots_below(filesystem: Any, path: str, address: str, depth: int) -> list[str]:
+    """Return the addresses of the LeRobot roots at a path or up to ``depth`` folders below it.
+
+    ``address`` is what the path is called; sorted. Depth 0 looks for one file and lists nothing.
+    """
+    path, address = path.rstrip("/"), address.rstrip("/")
+    if depth == 0:
+        return [address] if filesystem.exists(f"{path}/{INFO}") else []
+    found = {
+        str(name)[len(path) : -len(INFO)].strip("/")
+        for folders in range(depth + 1)
+        for name in filesystem.glob(f"{path}/{'*/' * folders}{INFO}")
+    }
+    return [f"{address}/{name}" if name else address for name in sorted(found)]
+
+
 def read_tasks(root: Root) -> dict[int, str]:
     """Return the texts of meta/tasks.parquet by number; nothing where the file is absent."""
     if not root.filesystem.exists(f"{root.folder}/{TASKS}"):
@@ -140,44 +158,78 @@ def read_tasks(root: Root) -> dict[int, str]:
     return dict(zip(table["task_index"].to_pylist(), table[text].to_pylist(), strict=True))
 
 
+class RowBatch:
+    """Rows of a parquet file that were read together; row 0 of them is row ``first`` there."""
+
+    def __init__(self, first: int, batch: Any) -> None:
+        self.first, self.batch = first, batch
+        self.stop = first + batch.num_rows
+        self.memo: dict[str, Any] = {}
+
+    def columns(self, columns: Sequence[Column]) -> dict[str, NDArray[Any]]:
+        """Return all rows of some columns, as ``values`` does."""
+        return {c.name: values(self.batch, c) for c in columns}
+
+
+class Span:
+    """The rows of one episode, in one batch or in several that follow each other."""
+
+    def __init__(self, batches: Sequence[RowBatch], start: int, stop: int) -> None:
+        pairs = [(b, max(start - b.first, 0), min(stop, b.stop) - b.first) for b in batches]
+        self.parts = [(b, slice(first, last)) for b, first, last in pairs if first < last]
+
+    def columns(self, columns: Sequence[Column]) -> dict[str, NDArray[Any]]:
+        """Return the episode's rows of some columns, as ``values`` does."""
+        import pyarrow as pa
+
+        pieces = [b.batch.slice(rows.start, rows.stop - rows.start) for b, rows in self.parts]
+        table = pa.Table.from_batches(pieces)
+        return {c.name: values(table, c) for c in columns}
+
+    def cut(self, memo: str, compute: Callable[[RowBatch], Mapping[str, Any]]) -> dict[str, Any]:
+        """Return the episode's rows of arrays that are computed once a batch, read-only."""
+        for batch, _ in self.parts:
+            if memo not in batch.memo:
+                batch.memo[memo] = compute(batch)
+        pieces = [(batch.memo[memo], rows) for batch, rows in self.parts]
+        if len(pieces) == 1:
+            return {name: array[pieces[0][1]] for name, array in pieces[0][0].items()}
+        joined = {n: np.concatenate([p[n][rows] for p, rows in pieces]) for n in pieces[0][0]}
+        for array in joined.values():
+            array.setflags(write=False)
+        return joined
+
+
 def spans(
     file: Any, columns: Sequence[str], wanted: Sequence[tuple[int, int]]
-) -> Iterator[tuple[int, Any]]:
-    """Yield (number, table of rows start .. stop - 1) for each wanted (start, stop), in one pass.
+) -> Iterator[tuple[int, Span]]:
+    """Yield (number, rows start .. stop - 1) for each wanted (start, stop), in one pass.
 
     The spans ascend and do not overlap; row groups that none touches are not read.
     """
-    import pyarrow as pa
-
-    sizes = [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)]
-    ends = np.cumsum([0, *sizes])
-    starts_wanted = np.array([s for s, _ in wanted])
-    stops_wanted = np.array([e for _, e in wanted])
-    touched = [
-        i
-        for i in range(len(sizes))
-        if ((starts_wanted < ends[i + 1]) & (stops_wanted > ends[i])).any()
-    ]
-    pieces: list[tuple[int, Any]] = []
+    ends = row_group_ends(file)
+    first_of = np.array([start for start, _ in wanted])
+    last_of = np.array([stop for _, stop in wanted])
+    batches: list[RowBatch] = []
     number = 0
-    for group in touched:
+    for group in range(len(ends) - 1):
+        if not ((first_of < ends[group + 1]) & (last_of > ends[group])).any():
+            continue
         row = int(ends[group])
         for batch in file.iter_batches(_BATCH_ROWS, row_groups=[group], columns=list(columns)):
-            pieces.append((row, batch))
+            batches.append(RowBatch(row, batch))
             row += batch.num_rows
             while number < len(wanted) and wanted[number][1] <= row:
-                start, stop = wanted[number]
-                yield number, pa.Table.from_batches(list(_cut(pieces, start, stop)))
+                yield number, Span(batches, *wanted[number])
                 number += 1
             floor = wanted[number][0] if number < len(wanted) else row
-            pieces = [(at, piece) for at, piece in pieces if at + piece.num_rows > floor]
+            batches = [b for b in batches if b.stop > floor]
 
 
-def _cut(pieces: list[tuple[int, Any]], start: int, stop: int) -> Iterator[Any]:
-    for at, piece in pieces:
-        first, last = max(start - at, 0), min(stop - at, piece.num_rows)
-        if first < last:
-            yield piece.slice(first, last - first)
+def row_group_ends(file: Any) -> NDArray[np.int64]:
+    """Return 0 and the row after each row group of a parquet file, (groups + 1,)."""
+    sizes = [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)]
+    return np.cumsum([0, *sizes])
 
 
 def values(table: Any, column: Column) -> NDArray[Any]:
@@ -191,7 +243,9 @@ def values(table: Any, column: Column) -> NDArray[Any]:
     """
     import pyarrow as pa
 
-    array = table[column.name].combine_chunks()
+    array = table[column.name]
+    if isinstance(array, pa.ChunkedArray):
+        array = array.combine_chunks()
     kind = array.type
     is_list = pa.types.is_list(kind) or pa.types.is_large_list(kind)
     rows, width = len(array), column.width

@@ -25,15 +25,23 @@ from mint_hub.loaders.lerobot_columns import (
     columns_of,
     dialect_of,
 )
-from mint_hub.loaders.lerobot_files import Root, open_root, read_tasks
+from mint_hub.loaders.lerobot_files import Root, RowBatch, Span, open_root, read_tasks
 from mint_hub.loaders.lerobot_index import INDEX_COLUMNS, check_spans, episode_index
+from mint_hub.loaders.lerobot_origin import (
+    ATTACHMENT,
+    ORIGIN_COLUMNS,
+    VIDEO_KEY,
+    attachment,
+    origin_warnings,
+    stated_uid,
+    video_uid,
+)
 from mint_hub.loaders.schema import SCHEMA_VERSION, Episode, EpisodeError
 
 SCALE_STATUS: Final = "scale-enlarged pseudo-label, not metric"
 """What the published labels are."""
 
 CONVENTIONS: Final = "camera: world-to-camera, OpenCV axes, metres; hands: camera frame"
-VIDEO_KEY: Final = "observation.images.ego"
 OURS: Final = "mint_episode"
 """Column of our own exports: JSON of what an Episode says beyond LeRobot's columns."""
 
@@ -42,7 +50,6 @@ INTRINSICS_TOLERANCE: Final = 0.02
 
 _ALIASES: Final = {"epickitchen": "epic", "epic-kitchens": "epic", "epic-kitchens-100": "epic"}
 _DOMAINS: Final = {"ego4d": "daily", "epic": "kitchen", "egodex": "tabletop"}
-_UID_COLUMNS: Final = ("video_uid", "uid", "video_id")
 _TOLD: Final = ("key", "image_size_hw", "text", "meta", "schema_version")
 _BULK: Final = ("stats/", "meta/episodes/")
 _LOG: Final = logging.getLogger(__name__)
@@ -64,7 +71,9 @@ def from_lerobot(
     view (vertical, horizontal), presence from ``hand_kept`` or ``{side}_kept``. Nothing is scaled
     or smoothed; an absent hand is ``hand_state.absent``. Times are those of the episode's video
     file: ``from_timestamp + k / fps``, from 0 where the root has no video. Keys are
-    ``<source>-<video uid>-<episode index>``, without the uid where the root does not say it.
+    ``<source>-<video uid>-<episode index>``, without the uid where the root does not state it.
+    ``meta["uid"]`` is the column ``video_uid``, ``uid`` or ``video_id`` of meta/episodes, else the
+    root's own video file, else missing: see ``lerobot_origin``, also for what ``attach`` needs.
 
     Args:
         root: a folder, or an address that fsspec opens (``hf://datasets/org/name/ego4d``).
@@ -84,7 +93,7 @@ def from_lerobot(
     if on_error not in ("raise", "skip"):
         raise ValueError(f"on_error: expected 'raise' or 'skip', got {on_error!r}")
     opened = open_root(root, storage_options)
-    reader = _Reader(opened, source, scale_status, image_size_hw)
+    reader = RootReader(opened, source, scale_status, image_size_hw)
     index = episode_index(opened)
     chosen = np.ones(len(index), bool)
     if episodes is not None:
@@ -110,23 +119,20 @@ def lerobot_episodes(
 
 
 def lerobot_roots(
-    folder: str | os.PathLike[str], storage_options: dict[str, Any] | None = None
+    folder: str | os.PathLike[str],
+    storage_options: dict[str, Any] | None = None,
+    *,
+    depth: int = 2,
 ) -> list[str]:
-    """Return the LeRobot roots at ``folder`` or up to two folders below it, sorted."""
+    """Return the LeRobot roots at ``folder`` or up to ``depth`` folders below it, sorted."""
     import fsspec
 
     address = os.fspath(folder).rstrip("/")
     filesystem, path = fsspec.core.url_to_fs(address, **(storage_options or {}))
-    path = str(path).rstrip("/")
-    found = {
-        str(name)[len(path) : -len(lerobot_files.INFO)].strip("/")
-        for depth in ("", "*/", "*/*/")
-        for name in filesystem.glob(f"{path}/{depth}{lerobot_files.INFO}")
-    }
-    return [f"{address}/{name}" if name else address for name in sorted(found)]
+    return lerobot_files.roots_below(filesystem, str(path), address, depth)
 
 
-class _Reader:
+class RootReader:
     """What all episodes of a root share while they are read."""
 
     def __init__(
@@ -142,18 +148,14 @@ class _Reader:
 
     def read(self, index: NDArray[Any], chosen: NDArray[Any], skip: bool) -> Iterator[Episode]:
         """Yield the chosen episodes, one data file after the other."""
-        places = index[["data/chunk_index", "data/file_index"]]
-        bounds = np.flatnonzero(np.append(True, places[1:] != places[:-1]))
-        for first, last in zip(bounds, [*bounds[1:], len(index)], strict=True):
-            part = index[first:last][chosen[first:last]]
-            if len(part):
-                yield from self._read_file(part, skip)
+        for part in files_of(index):
+            kept = index[part][chosen[part]]
+            if len(kept):
+                yield from self.read_file(kept, skip)
 
-    def _read_file(self, part: NDArray[Any], skip: bool) -> Iterator[Episode]:
+    def read_file(self, part: NDArray[Any], skip: bool) -> Iterator[Episode]:
         """Yield the episodes of one data file; ``part`` is sorted by first row."""
-        path = self.root.data_file(
-            int(part[0]["data/chunk_index"]), int(part[0]["data/file_index"])
-        )
+        path = data_file_of(self.root, part)
         where = self.root.name(path)
         starts = part["dataset_from_index"] - part["base"]
         stops = starts + part["length"]
@@ -166,11 +168,11 @@ class _Reader:
             check_spans(where, part, starts, stops, file.metadata.num_rows)
             columns = [c for c in columns_of(dialect, extra=True) if c.name in names]
             wanted = list(zip(starts.tolist(), stops.tolist(), strict=True))
-            for number, table in lerobot_files.spans(file, [c.name for c in columns], wanted):
+            for number, span in lerobot_files.spans(file, [c.name for c in columns], wanted):
                 entry = part[number]
                 place = f"{where}, episode {entry['episode_index']}"
                 try:
-                    yield self._episode(entry, path, dialect, columns, table)
+                    yield self._episode(entry, path, dialect, columns, span)
                 except (LeRobotError, EpisodeError) as error:
                     if not skip:
                         raise LeRobotError(f"{place}: {error}") from None
@@ -182,12 +184,11 @@ class _Reader:
         path: str,
         dialect: Dialect,
         columns: list[Column],
-        table: Any,
+        span: Span,
     ) -> Episode:
-        got = {c.name: lerobot_files.values(table, c) for c in columns}
+        got, arrays = _decoded(dialect, columns, span)
         _check_counters(got, entry)
         row = self._row(entry)
-        arrays = lerobot_codec.decode(dialect, got)
         ours = _ours(row[OURS]) if row.get(OURS) else None
         there = ours["extra"] if ours else [c.name for c in EXTRA]
         optional = {c.name: got.get(c.name) if c.name in there else None for c in EXTRA}
@@ -214,6 +215,30 @@ class _Reader:
                 self.rows = number, file.read(columns=names)
         return self.rows[1].slice(int(entry["row"]), 1).to_pylist()[0]
 
+    def groups(self, index: NDArray[Any]) -> Iterator[tuple[str, str | None]]:
+        """Yield video uid and participant of each index record, from meta/episodes alone.
+
+        They are those of the episode's ``meta``; the key stands for a uid that it does not have.
+        """
+        known: tuple[int, list[dict[str, Any]]] | None = None
+        for number, place, row_number in index[["episode_index", "file", "row"]].tolist():
+            if known is None or known[0] != place:
+                with self.root.parquet(self.episode_files[place]) as file:
+                    names = [n for n in (*ORIGIN_COLUMNS, OURS) if n in file.schema_arrow.names]
+                    rows = file.read(columns=names)
+                known = place, rows.to_pylist() if names else [{}] * len(rows)
+            row = known[1][row_number]
+            if row.get(OURS):
+                told = _ours(row[OURS])
+                participant = told["meta"].get("participant")
+                yield str(told["meta"].get("uid") or told["key"]), participant
+            else:
+                participant = attachment(row, self.root.info).get("participant")
+                yield video_uid(row) or self._key(None, number), participant
+
+    def _key(self, uid: str | None, number: int) -> str:
+        return "-".join(slug(part) for part in (self.source, uid, f"{number:06d}") if part)
+
     def _described(
         self,
         entry: NDArray[Any],
@@ -225,21 +250,26 @@ class _Reader:
         """Return what an episode of another project's root is called and where it is from."""
         number = int(entry["episode_index"])
         text, warnings = lerobot_text.segments(row, self.tasks, got.get("main_type"))
-        uid = next((str(row[name]) for name in _UID_COLUMNS if row.get(name)), None)
         if dialect == "world":
             warnings += _doubts(got, self._image_size())
+        warnings += origin_warnings(row)
         video = {
             n.rsplit("/", 1)[1]: v for n, v in row.items() if n.startswith(f"videos/{VIDEO_KEY}/")
         }
-        known = {c.name for c in INDEX_COLUMNS} | {"tasks", "atomic_segments", "dataset_to_index"}
+        known = {*(c.name for c in INDEX_COLUMNS), *ATTACHMENT} | {
+            "tasks",
+            "atomic_segments",
+            "dataset_to_index",
+        }
         other = {n: v for n, v in row.items() if n not in known and not n.startswith("videos/")}
         meta: dict[str, Any] = {
             "source": self.source,
-            "uid": uid or f"{self.source}-{number:06d}",
+            "uid": video_uid(row),
             "domain": _DOMAINS.get(self.source),
             "tasks": list(row.get("tasks") or ()),
             "main_hand": lerobot_text.main_hand(got.get("main_type")),
             "fps": self.root.fps,
+            **attachment(row, self.root.info),
             "scale_status": self.scale_status,
             "shape_space": "mano",
             "conventions": CONVENTIONS,
@@ -254,9 +284,8 @@ class _Reader:
             },
             "warnings": warnings,
         }
-        parts = (self.source, uid, f"{number:06d}")
         return {
-            "key": "-".join(slug(part) for part in parts if part),
+            "key": self._key(stated_uid(row), number),
             "image_size_hw": self._image_size(),
             "text": [segment.to_dict() for segment in text],
             "schema_version": SCHEMA_VERSION,
@@ -279,14 +308,56 @@ class _Reader:
         return int(shape[height]), int(shape[width])
 
 
+def files_of(index: NDArray[Any]) -> Iterator[slice]:
+    """Yield which records of an index are of one data file, for each file in order."""
+    places = index[["data/chunk_index", "data/file_index"]]
+    seams = (np.flatnonzero(places[1:] != places[:-1]) + 1).tolist()
+    ends = zip([0, *seams], [*seams, len(index)], strict=True)
+    return (slice(first, last) for first, last in ends if first < last)
+
+
+def data_file_of(root: Root, part: NDArray[Any]) -> str:
+    """Return where the data file of these index records lies, within the root."""
+    return root.data_file(int(part[0]["data/chunk_index"]), int(part[0]["data/file_index"]))
+
+
+def _decoded(
+    dialect: Dialect, columns: list[Column], span: Span
+) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
+    """Return columns and decoded arrays of an episode, made for all rows read with it if possible.
+
+    Where any of those rows are wrong, the episode's own are taken by themselves, so that an error
+    is that of its own episode and counts its frames.
+    """
+
+    def decoded(batch: RowBatch) -> dict[str, NDArray[Any]]:
+        read = batch.columns(columns)
+        arrays = lerobot_codec.decode(dialect, read)
+        for array in arrays.values():
+            array.setflags(write=False)
+        return {**read, **{f"{_DECODED}{name}": array for name, array in arrays.items()}}
+
+    try:
+        both = span.cut("decoded", decoded)
+    except LeRobotError:
+        got = span.columns(columns)
+        return got, lerobot_codec.decode(dialect, got)
+    arrays = {n.removeprefix(_DECODED): both.pop(n) for n in list(both) if n.startswith(_DECODED)}
+    return both, arrays
+
+
+_DECODED: Final = "decoded "
+
+
 def _check_counters(got: Mapping[str, NDArray[Any]], entry: NDArray[Any]) -> None:
     """Refuse rows that are of another episode, or not its frames 0, 1, 2, ..."""
     length, number = int(entry["length"]), int(entry["episode_index"])
-    expected = {"episode_index": np.full(length, number), "frame_index": np.arange(length)}
+    expected = {"episode_index": number, "frame_index": np.arange(length)}
     for name, want in expected.items():
         if (bad := np.flatnonzero(got[name] != want)).size:
             k = int(bad[0])
-            raise LeRobotError(f"{name}: expected {want[k]}, got {got[name][k]} at frame {k}")
+            right = np.broadcast_to(want, length)[k]
+            raise LeRobotError(f"{name}: expected {right}, got {got[name][k]} at frame {k}")
 
 
 def _ours(text: str) -> dict[str, Any]:

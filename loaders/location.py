@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from mint_hub.assets import asset_path
 from mint_hub.loaders.derived import SPLITS, VIDEO_MEMBER
-from mint_hub.loaders.lerobot_files import INFO
+from mint_hub.loaders.lerobot_files import roots_below
 from mint_hub.loaders.manifest import MANIFEST, Manifest, ShardRecord, unseal
 from mint_hub.loaders.tar_layout import CorpusError
 
@@ -83,10 +83,11 @@ def corpus_files(
         location = asset_path("sample_corpus")
     chosen = os.fspath(location or os.environ.get(LOCATION_VARIABLE) or LOCATION)
     place = _find(chosen, revision, token)
-    folders = [f for part in _parts(place, config) for f in place.folders(part)]
+    parts = _parts(place, config)
+    folders = [f for part in parts for f in place.folders(part)]
     splits: dict[str, list[Shard]] = {}
     packed, stamp = False, hashlib.sha256(f"{place.identity} {config}".encode())
-    for root in _lerobot_roots(place, folders):
+    for root in [r for part in parts for r in place.lerobot_roots(part)]:
         for split in SPLITS:
             splits.setdefault(split, []).append(Shard(root, split))
         folders = [f for f in folders if f"{place.prefix}{_parent(f)}" != root]
@@ -107,12 +108,6 @@ def _parts(place: "_Place", config: str) -> tuple[str, ...]:
     return PARTS if config == ALL and not place.folders(ALL) else (config,)
 
 
-def _lerobot_roots(place: "_Place", folders: list[str]) -> list[str]:
-    """Return the addresses of the LeRobot roots among the parents of ``folders``."""
-    parents = dict.fromkeys(_parent(folder) for folder in folders if _name(folder) == "meta")
-    return [f"{place.prefix}{p}" for p in parents if place.fs.exists(f"{p}/{INFO}")]
-
-
 @dataclass(frozen=True)
 class _Place:
     """A folder of some file system; ``identity`` is what it is called in stamps.
@@ -128,13 +123,22 @@ class _Place:
     repository: tuple[str, str | None, str | bool | None] | None = None  # name, revision, token
 
     def folders(self, name: str) -> list[str]:
-        """Return the folders in a folder, sorted; none where there is no such folder."""
-        try:
-            entries: list[dict[str, Any]] = self.fs.ls(f"{self.root}/{name}", detail=True)
-        except (FileNotFoundError, NotADirectoryError):
-            return []
-        shown = [e for e in entries if not _name(e["name"]).startswith(".")]
-        return sorted(str(e["name"]) for e in shown if self._is_folder(e))
+        """Return the folders in a folder, sorted; none where there is no such folder.
+
+        A web server may not list what it has: then the splits are asked for by their names.
+        """
+        path = f"{self.root}/{name}"
+        shown = [e for e in self._listed(path) if not _name(e["name"]).startswith(".")]
+        found = sorted(str(e["name"]).rstrip("/") for e in shown if self._is_folder(e))
+        if not found and self._is_web and name:
+            asked = [f"{path}/{split}" for split in SPLITS]
+            found = [folder for folder in asked if self.fs.exists(f"{folder}/{MANIFEST}")]
+        return found
+
+    def lerobot_roots(self, name: str) -> list[str]:
+        """Return the address of a folder that is a LeRobot root; nothing where it is none."""
+        path = f"{self.root}/{name}"
+        return roots_below(self.fs, path, f"{self.prefix}{path}", depth=0)
 
     def stamp_files(self, address: str, stamp: Any) -> None:
         """Add every file below an address to a stamp: its name, size and time."""
@@ -150,8 +154,30 @@ class _Place:
 
     def files(self, folder: str) -> dict[str, dict[str, Any]]:
         """Return the files in a folder by name, links to files included."""
-        entries: list[dict[str, Any]] = self.fs.ls(folder, detail=True)
-        return {_name(e["name"]): e for e in entries if not self._is_folder(e)}
+        return {_name(e["name"]): e for e in self._listed(folder) if not self._is_folder(e)}
+
+    def file(self, path: str) -> dict[str, Any] | None:
+        """Return what is known of one file, its size included; None where there is none."""
+        try:
+            entry: dict[str, Any] = self.fs.info(path)
+        except FileNotFoundError:
+            return None
+        return entry
+
+    @property
+    def _is_web(self) -> bool:
+        return self.root.startswith(("http://", "https://"))
+
+    def _listed(self, path: str) -> list[dict[str, Any]]:
+        try:
+            entries: list[dict[str, Any]] = self.fs.ls(path, detail=True)
+        except (FileNotFoundError, NotADirectoryError):
+            return []
+        except Exception:  # a web server's own way to refuse
+            if not self._is_web:
+                raise
+            return []
+        return entries
 
     def manifest(self, folder: str) -> Manifest:
         """Read a split's shards.json; one from the hub stays in its cache, to be read offline."""
@@ -176,7 +202,7 @@ class _Place:
 def _split(place: _Place, folder: str, stamp: Any) -> tuple[Manifest, list[Shard]]:
     """Return what a split consists of, once every shard is seen to be there in its size."""
     files = place.files(folder)
-    if MANIFEST not in files:
+    if MANIFEST not in files and place.file(f"{folder}/{MANIFEST}") is None:
         raise CorpusError(
             f"{place.prefix}{folder}: expected {MANIFEST}, got none; a split without it is not "
             "complete: run its writer again"
@@ -185,7 +211,9 @@ def _split(place: _Place, folder: str, stamp: Any) -> tuple[Manifest, list[Shard
     shards: list[Shard] = []
     for record in manifest.shards:
         url = f"{place.prefix}{folder}/{record.name}"
-        found = files.get(record.name)
+        found = files.get(record.name) or {"size": None}
+        if found["size"] is None:
+            found = place.file(f"{folder}/{record.name}")
         if found is None or found["size"] != record.bytes:
             got = "none" if found is None else f"{found['size']} bytes"
             raise CorpusError(

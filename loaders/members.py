@@ -11,7 +11,7 @@ MAX_COMPACT_ERROR_DEG), poses and scores as float32, times within TIME_TOLERANCE
 ``hand_state.absent``.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, cast
 
 import numpy as np
@@ -21,7 +21,7 @@ from mint_hub.conventions import SIDES
 from mint_hub.geometry import camera_state
 from mint_hub.geometry import hand_state as hands
 from mint_hub.geometry.rotations import matrix_to_rot6d_rows, rot6d_rows_to_matrix
-from mint_hub.loaders.fields import EpisodeError, placed
+from mint_hub.loaders.fields import EpisodeError, placed, row_products
 from mint_hub.loaders.member_table import (
     ABSENT,
     EXTRA,
@@ -61,6 +61,7 @@ __all__ = [
     "decode",
     "decode_meta",
     "encode",
+    "encode_all",
     "member",
     "member_names",
 ]
@@ -95,26 +96,72 @@ def encode(episode: Episode, format: Format = "compact", extra: bool = False) ->
             although there is no ``extra.npy``, or ``meta`` entries of another type than declared.
 
     """
-    try:
-        return _encode(episode, format, extra)
-    except EpisodeError as error:
-        raise placed(error, "", episode.key) from None
+    return next(encode_all([episode], format, extra))
 
 
-def _encode(episode: Episode, format: Format, extra: bool) -> dict[str, bytes]:
+def encode_all(
+    episodes: Sequence[Episode], format: Format = "compact", extra: bool = False
+) -> Iterator[dict[str, bytes]]:
+    """Yield what ``encode`` returns for each of some episodes, their frames computed together.
+
+    Raises:
+        EpisodeError: as ``encode``, when the episode at fault is reached.
+
+    """
     names = member_names(format, extra)
-    absent = hands.absent(episode.presence.shape)
-    state = np.where(episode.presence[..., None], episode.hand_state, absent)
-    shape = _shape_of(episode, state) if format == "compact" else np.zeros((2, 10), np.float32)
+    stops = np.cumsum([episode.num_frames for episode in episodes]).tolist()
+    rows = _rows_of(episodes, format)
+    for episode, stop in zip(episodes, stops, strict=True):
+        own = {name: array[stop - episode.num_frames : stop] for name, array in rows.items()}
+        try:
+            yield _encode(episode, own, format, names)
+        except EpisodeError as error:
+            raise placed(error, "", episode.key) from None
+
+
+def _rows_of(episodes: Sequence[Episode], format: Format) -> dict[str, NDArray[Any]]:
+    """Rows of the arrays whose rows depend on their own frame only, of all episodes, by member.
+
+    Under _SHAPES are the shapes (frames, 2, 10).
+    """
+    state = np.concatenate([episode.hand_state for episode in episodes])
+    presence = np.concatenate([episode.presence for episode in episodes])
+    T = np.concatenate([episode.T_camera_from_world for episode in episodes])
+    fov = np.concatenate([episode.fov_vh_rad for episode in episodes])
+    state[~presence] = hands.absent()
+    code = presence.astype(np.float32)
+    stop = 0
+    for episode in episodes:
+        stop += episode.num_frames
+        if episode.filled is not None:
+            code[stop - episode.num_frames : stop][episode.filled] = FILLED
+    camera = camera_state.from_matrices(T, fov).pack()
+    wrists = state[..., hands.TRANSLATION].reshape(len(state), -1)
+    with np.errstate(over="ignore"):
+        traj = np.concatenate([camera.astype(np.float32), wrists, code], axis=-1)
+    numbers = _rot6d_of(state) if format == "compact" else state.reshape(len(state), -1)
+    return {
+        TRAJ: traj,
+        ROT6D if format == "compact" else STATE: numbers,
+        _SHAPES: state[..., hands.SHAPE],
+    }
+
+
+_SHAPES: Final = "shapes"
+
+
+def _encode(
+    episode: Episode, rows: dict[str, NDArray[Any]], format: Format, names: tuple[str, ...]
+) -> dict[str, bytes]:
+    extra = EXTRA in names
+    shapes = rows[_SHAPES]
+    shape = _shape_of(episode, shapes) if format == "compact" else np.zeros((2, 10), np.float32)
+    _check_lengths(episode, rows[TRAJ])
     offsets = episode.timestamps_s - _regular_times(
         float(episode.timestamps_s[0]), episode.fps, episode.num_frames
     )
-    arrays: dict[str, NDArray[Any]] = {TRAJ: _traj_of(episode, state)}
-    if format == "compact":
-        arrays[ROT6D] = _rot6d_of(state)
-    else:
-        arrays[STATE] = state.reshape(episode.num_frames, -1)
     _check_times(offsets, episode.fps, MAX_OFFSET_S if extra else TIME_TOLERANCE_S)
+    arrays = dict(rows)
     if extra:
         score = episode.presence_score
         score = np.full(episode.presence.shape, np.nan) if score is None else score
@@ -124,20 +171,12 @@ def _encode(episode: Episode, format: Format, extra: bool) -> dict[str, bytes]:
     return members
 
 
-def _traj_of(episode: Episode, state: NDArray[np.float32]) -> NDArray[np.float32]:
-    camera = camera_state.from_matrices(episode.T_camera_from_world, episode.fov_vh_rad)
-    code = episode.presence.astype(np.float32)
-    if episode.filled is not None:
-        code[episode.filled] = FILLED
-    wrists = hands.unpack(state).translation.reshape(len(state), -1)
-    with np.errstate(over="ignore"):
-        numbers = camera.pack().astype(np.float32)
-    if (far := np.flatnonzero(~np.isfinite(numbers).all(axis=-1))).size:
+def _check_lengths(episode: Episode, traj: NDArray[np.float32]) -> None:
+    if (far := np.flatnonzero(~np.isfinite(traj).all(axis=-1))).size:
         raise EpisodeError(
             f"T_camera_from_world: expected lengths that float32 can say, got "
             f"{episode.T_camera_from_world[far[0], :3, 3].tolist()} at frame {far[0]}"
         )
-    return np.concatenate([numbers, wrists, code], axis=-1)
 
 
 def _check_times(offsets: NDArray[np.float64], fps: float, tolerance: float) -> None:
@@ -152,19 +191,16 @@ def _check_times(offsets: NDArray[np.float64], fps: float, tolerance: float) -> 
 
 def _rot6d_of(state: NDArray[np.float32]) -> NDArray[np.float16]:
     """Rotations as rows (T, 192): made orthonormal where they are not, then rounded."""
-    rows = state[..., ROTATIONS].reshape(len(state), -1, 2, 3)
-    a, b = rows[..., 0, :], rows[..., 1, :]
-    gram = [np.einsum("...i,...i->...", x, y) for x, y in ((a, a), (b, b), (a, b))]
-    off = np.maximum(np.maximum(np.abs(gram[0] - 1), np.abs(gram[1] - 1)), np.abs(gram[2]))
+    rows = state[..., ROTATIONS].reshape(-1, 6)
+    aa, bb, ab = row_products(rows)
+    off = np.maximum(np.maximum(np.abs(aa - 1), np.abs(bb - 1)), np.abs(ab))
     if (bad := off > _UNIT_TOLERANCE).any():
-        exact = rows[bad].reshape(-1, 6).astype(np.float64)
-        rows[bad] = matrix_to_rot6d_rows(rot6d_rows_to_matrix(exact)).reshape(-1, 2, 3)
+        rows[bad] = matrix_to_rot6d_rows(rot6d_rows_to_matrix(rows[bad].astype(np.float64)))
     return rows.reshape(len(state), -1).astype(np.float16)
 
 
-def _shape_of(episode: Episode, state: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Shape numbers of both hands, (2, 10): those of the first frame in which each is present."""
-    shapes: NDArray[np.float32] = state[..., hands.SHAPE]
+def _shape_of(episode: Episode, shapes: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Shape of both hands, (2, 10): of ``shapes`` (T, 2, 10) where each is first present."""
     shape = np.zeros(shapes.shape[1:], np.float32)
     for hand, side in enumerate(SIDES):
         there = shapes[episode.presence[:, hand], hand]

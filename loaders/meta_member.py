@@ -3,12 +3,13 @@
 META_FIELDS declares every entry once. Canonical means UTF-8, sorted names, no spaces, so that equal
 episodes are equal bytes. Entries of ``Episode.meta`` that META_FIELDS names stand at the top, so
 that an index may hold them as columns (None where the episode does not say); all others stay under
-``meta``.
+``meta``. Lists with a value a frame (PER_FRAME_META) are there in the short form of
+``source_times``, or in full as older files have them; ``decode_meta`` returns the list.
 """
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal, cast
 
@@ -16,7 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mint_hub.geometry.hand_state import NUM_SHAPE_PARAMS
-from mint_hub.loaders.fields import EpisodeError, TextSegment, checked_key, checked_size, placed
+from mint_hub.loaders import source_times
+from mint_hub.loaders.fields import (
+    PER_FRAME_META,
+    EpisodeError,
+    TextSegment,
+    checked_key,
+    checked_size,
+    placed,
+)
 from mint_hub.loaders.member_table import META, Format
 from mint_hub.loaders.schema import SCHEMA_VERSION, Episode
 
@@ -59,8 +68,19 @@ META_FIELDS: Final = (
     _of_meta("conventions", "any", "", "axes and units of the labels, in words"),
     _of_meta("hand_model", "any", "", "hand model and version behind the labels"),
     _of_meta("pipeline", "any", "", "version of the labelling pipeline"),
-    _of_meta("quality", "any", "", "what quality checks said"),
-    MetaField("meta", "object", "", "the other entries of Episode.meta"),
+    _of_meta(
+        "quality",
+        "any",
+        "",
+        "what quality checks said; its entry hands says why no hand can be read, if so: absent "
+        "then does not mean that no hand was there",
+    ),
+    MetaField(
+        "meta",
+        "object",
+        "",
+        "the other entries of Episode.meta; source_timestamps_s in the short form of source_times",
+    ),
 )
 """Entries of the ``json`` member, declared once; all are always there."""
 
@@ -77,6 +97,9 @@ def encode_meta(episode: Episode, format: Format, shape: NDArray[np.float32]) ->
     """
     meta = dict(episode.meta)
     meta.pop("fps", None)
+    for name in PER_FRAME_META:
+        if meta.get(name) is not None:
+            meta[name] = source_times.pack(meta[name])
     promoted = {name: meta.pop(name, None) for name in _FROM_META}
     values = {
         "key": episode.key,
@@ -115,6 +138,9 @@ def decode_meta(data: Any, where: str = "") -> dict[str, Any]:
         values = _parsed(data)
         key = checked_key(values.get("key"))
         _check_entries(values)
+        for name in PER_FRAME_META:
+            if (times := values["meta"].get(name)) is not None:
+                values["meta"][name] = source_times.unpack(times, values["num_frames"])
     except EpisodeError as error:
         raise placed(EpisodeError(f"{META} {error}"), where, key) from None
     stated = {name: values[name] for name in _FROM_META if values[name] is not None}
@@ -170,15 +196,7 @@ def _check_entries(values: Mapping[str, Any]) -> None:
 def _check_kind(field: MetaField, value: object) -> None:
     if value is None and field.optional:
         return
-    good = {
-        "string": isinstance(value, str),
-        "integer": isinstance(value, int) and not isinstance(value, bool),
-        "number": _is_finite(value),
-        "array": isinstance(value, Sequence) and not isinstance(value, str),
-        "object": isinstance(value, Mapping),
-        "any": True,
-    }[field.kind]
-    if not good:
+    if not _IS_KIND[field.kind](value):
         raise EpisodeError(f"{field.name}: expected {field.kind}, got {value!r}")
 
 
@@ -186,6 +204,16 @@ def _is_finite(value: object) -> bool:
     if not isinstance(value, int | float) or isinstance(value, bool):
         return False
     return abs(value) <= sys.float_info.max
+
+
+_IS_KIND: Final[dict[Kind, Callable[[object], bool]]] = {
+    "string": lambda value: isinstance(value, str),
+    "integer": lambda value: isinstance(value, int) and not isinstance(value, bool),
+    "number": _is_finite,
+    "array": lambda value: isinstance(value, Sequence) and not isinstance(value, str),
+    "object": lambda value: isinstance(value, Mapping),
+    "any": lambda value: True,
+}
 
 
 def _check_shape(value: object) -> None:

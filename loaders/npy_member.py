@@ -15,11 +15,17 @@ from mint_hub.loaders.member_table import EXTRA, MEMBERS, Member, member
 
 def npy_bytes(array: NDArray[Any], spec: Member) -> bytes:
     """Return the array as an npy file of format 1.0, little endian, C order."""
-    dtype = np.dtype(spec.dtype).newbyteorder("<")
-    buffer = io.BytesIO()
-    contiguous = np.ascontiguousarray(array, dtype)
-    np.lib.format.write_array(buffer, contiguous, (1, 0), allow_pickle=False)
-    return buffer.getvalue()
+    contiguous = np.ascontiguousarray(array, np.dtype(spec.dtype).newbyteorder("<"))
+    numbers: Any = contiguous.reshape(-1).view(np.uint8).data
+    return b"".join([_header(contiguous.dtype.str, contiguous.shape), numbers])
+
+
+@lru_cache(maxsize=8192)
+def _header(descr: str, shape: tuple[int, ...]) -> bytes:
+    stream = io.BytesIO()
+    fields = {"descr": descr, "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(stream, fields)
+    return stream.getvalue()
 
 
 def arrays_of(members: Mapping[str, Any], where: str = "") -> dict[str, NDArray[Any]]:
@@ -32,9 +38,9 @@ def arrays_of(members: Mapping[str, Any], where: str = "") -> dict[str, NDArray[
     """
     arrays = {m.name: _array_of(members[m.name], m, where) for m in MEMBERS if m.name in members}
     for name, array in arrays.items():
-        finite = np.isfinite(array[:, :1] if name == EXTRA else array)
-        if not finite.all():
-            frame, column = (int(i) for i in np.argwhere(~finite)[0])
+        checked = array[:, :1] if name == EXTRA else array
+        if not _all_finite(checked):
+            frame, column = (int(i) for i in np.argwhere(~np.isfinite(checked))[0])
             message = f"{name}: expected finite numbers, got {array[frame, column]}"
             label = f"{message} at frame {frame}, {_column_at(member(name), column)}"
             raise placed(EpisodeError(label), where)
@@ -78,6 +84,13 @@ def _array_of(data: Any, spec: Member, where: str) -> NDArray[Any]:
     array = np.frombuffer(data, dtype, math.prod(shape), start).reshape(shape)
     array.setflags(write=False)
     return array
+
+
+def _all_finite(array: NDArray[Any]) -> bool:
+    """Whether no number is infinite or NaN: those have every bit of the exponent set."""
+    bits = array.view(f"<u{array.itemsize}")
+    exponent = np.array(np.inf, array.dtype).view(bits.dtype)
+    return not ((bits & exponent) == exponent).any()
 
 
 @lru_cache(maxsize=8192)

@@ -5,9 +5,11 @@ fetched once and kept under its hash: whatever the address, equal content is one
 and content that is not what was written never enters it.
 """
 
+import errno
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -15,7 +17,7 @@ from mint_hub.loaders.atomic import replacing
 from mint_hub.loaders.manifest import MANIFEST, FileRecord, Manifest, read_manifest, unseal
 from mint_hub.loaders.tar_layout import CorpusError
 
-_CHUNK: Final = 1 << 20
+_OUR_DISK: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EPERM})
 
 
 class SplitFiles(Protocol):
@@ -125,32 +127,34 @@ class RemoteFiles:
 
     def manifest(self) -> Manifest:
         """Fetch ``shards.json``; it is never cached, since nothing says what it must be."""
-        parts: list[bytes] = []
-        self._fetch(MANIFEST, parts.append)
         where = f"{self._url}/{MANIFEST}"
-        return Manifest.from_dict(unseal(b"".join(parts), where), where)
+        with self._away(MANIFEST) as (filesystem, path):
+            data: bytes = filesystem.cat_file(path)
+        return Manifest.from_dict(unseal(data, where), where)
 
     def path(self, record: FileRecord) -> Path:
         """Return the file in the cache, after fetching it where it is not there yet.
 
         Raises:
-            CorpusError: the address has no such file, or other bytes than were written.
+            CorpusError: the address has no such file, breaks off, or has other bytes than were
+                written. Nothing of it stays in the cache.
+            ImportError: fsspec needs a package for this kind of address; names it.
+            OSError: the cache cannot be written.
 
         """
         path = self._cache / record.sha256[:2] / record.sha256
         if path.is_file() and path.stat().st_size == record.bytes:
             return path
-        digest = hashlib.sha256()
         with replacing(path) as temporary:
-            with temporary.open("wb") as file:
-
-                def take(chunk: bytes) -> None:
-                    digest.update(chunk)
-                    file.write(chunk)
-
-                self._fetch(record.name, take, record)
-            if digest.hexdigest() != record.sha256:
-                raise _changed(f"{self._url}/{record.name}", record, digest.hexdigest())
+            with self._away(record.name, record) as (filesystem, remote):
+                filesystem.get_file(remote, str(temporary))
+            if (got := temporary.stat().st_size) != record.bytes:
+                where = f"{self._url}/{record.name}"
+                raise CorpusError(
+                    f"{where}: expected {record.bytes} bytes{_lost(record)}, got {got}"
+                )
+            if (digest := _sha256(temporary)) != record.sha256:
+                raise _changed(f"{self._url}/{record.name}", record, digest)
         return path
 
     def check(self, record: FileRecord, full: bool) -> None:
@@ -162,18 +166,24 @@ class RemoteFiles:
             path.unlink()
             self.path(record)
 
-    def _fetch(
-        self, name: str, take: Callable[[bytes], Any], record: FileRecord | None = None
-    ) -> None:
-        import fsspec
+    @contextmanager
+    def _away(self, name: str, record: FileRecord | None = None) -> Generator[tuple[Any, str]]:
+        """Give file system and path of a file there; whatever goes wrong there names the file."""
+        from fsspec.core import url_to_fs
 
         url = f"{self._url}/{name}"
+        filesystem, path = url_to_fs(url, **self._options)
         try:
-            with fsspec.open(url, "rb", **self._options) as file:
-                while chunk := file.read(_CHUNK):  # pyright: ignore[reportAttributeAccessIssue]
-                    take(chunk)
+            yield filesystem, path
         except FileNotFoundError:
             raise CorpusError(f"{url}: expected this file{_lost(record)}, got none") from None
+        except Exception as error:  # of any file system's own kind
+            if isinstance(error, OSError) and error.errno in _OUR_DISK:
+                raise
+            raise CorpusError(
+                f"{url}: expected this file{_lost(record)}, got none as fetching it failed: "
+                f"{type(error).__name__}: {error}"
+            ) from error
 
 
 def _sha256(path: Path) -> str:

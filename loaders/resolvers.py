@@ -53,6 +53,8 @@ class VideoReference:
             ``video_start_sec``); None where the labels use the container's clock.
         lens: what `lens_from` takes, where labels refer to rectified pictures; None where not.
         undistorted: whether labels refer to undistorted pictures.
+        turn_clockwise_deg: 0, 90, 180 or 270: how the picture, rectified if it has to be, is turned
+            to be that of the labels (``image_turn_clockwise_deg``, of HOT3D's Aria cameras).
 
     """
 
@@ -67,6 +69,7 @@ class VideoReference:
     video_start_s: float | None = None
     lens: Any = None
     undistorted: bool = False
+    turn_clockwise_deg: int = 0
 
     @classmethod
     def of(cls, episode: "Episode | Mapping[str, Any]") -> "VideoReference":
@@ -98,6 +101,7 @@ class VideoReference:
             video_start_s=_number(meta, "video_start_sec", key),
             lens=meta.get("lens"),
             undistorted=bool(meta.get("undistorted")),
+            turn_clockwise_deg=_turn(meta, key),
         )
 
 
@@ -272,6 +276,16 @@ def _number(meta: Mapping[str, Any], name: str, key: str) -> float | None:
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
         raise ValueError(f"meta[{name!r}]: expected a number, got {value!r} (episode {key})")
     return float(value)
+
+
+def _turn(meta: Mapping[str, Any], key: str) -> int:
+    turn = _number(meta, "image_turn_clockwise_deg", key) or 0
+    if turn not in (0, 90, 180, 270):
+        raise ValueError(
+            f"meta['image_turn_clockwise_deg']: expected 0, 90, 180 or 270, got {turn:g} "
+            f"(episode {key})"
+        )
+    return int(turn)
 
 
 def _named(video: VideoReference) -> str:

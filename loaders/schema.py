@@ -65,6 +65,10 @@ class Episode:
     copied unless already read-only, and made read-only. Rotations of absent hands must be valid
     too: ``hand_state.absent`` is the canonical filling. ``meta`` becomes plain JSON values.
 
+    Where hands were annotated in a way that cannot be read, both are absent throughout and
+    ``meta["quality"]["hands"]`` says why ("unavailable: needs MANO"); without that entry, absent
+    means that no hand was there or none was found.
+
     Raises:
         EpisodeError: a ValueError that names the field, what was expected, what came, and the key.
 

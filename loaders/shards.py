@@ -7,24 +7,30 @@ the right episode. The same episodes and ShardSpec give the same bytes, over any
 and interruptions.
 
 Order within a split: episodes that can be indexed (``len`` and ``[i]``) are shuffled as a whole by
-``order.Order(len, seed)``; a stream is shuffled through a buffer of ``shuffle_buffer`` episodes;
-``seed=None`` keeps them as they come.
+``order.Order(len, seed)``; a stream, in slices or not, is shuffled through a buffer of
+``shuffle_buffer`` episodes; ``seed=None`` keeps them as they come.
 """
 
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import asdict, dataclass
-from itertools import islice
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO, Final, Protocol, runtime_checkable
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mint_hub.loaders.index import ShardSummary, episodes_schema, summarise, write_rows
+from mint_hub.loaders.action_stats import halvings_for
+from mint_hub.loaders.index import (
+    ShardSummary,
+    build_index,
+    episodes_schema,
+    summarise,
+    write_rows,
+)
 from mint_hub.loaders.manifest import (
     EPISODES,
     INDEX,
@@ -34,29 +40,34 @@ from mint_hub.loaders.manifest import (
     record_of,
     write_sealed,
 )
-from mint_hub.loaders.members import Format, encode
-from mint_hub.loaders.order import Order
+from mint_hub.loaders.members import Format
 from mint_hub.loaders.parallel import in_order
-from mint_hub.loaders.schema import Episode
+from mint_hub.loaders.shard_source import (
+    EncodedSample,
+    Episodes,
+    ExtraMembers,
+    Indexed,
+    encoded_samples,
+    length_of,
+)
 from mint_hub.loaders.stats import CorpusStats, write_stats
-from mint_hub.loaders.tar_layout import END, CorpusError, pack_sample
+from mint_hub.loaders.tar_layout import END, CorpusError
 from mint_hub.loaders.unfinished import SHARD_BYTES, ShardSpec, UnfinishedSplit
 
+__all__ = [
+    "VALIDATION",
+    "CorpusError",
+    "CorpusReport",
+    "Episodes",
+    "ExtraMembers",
+    "Indexed",
+    "ShardSpec",
+    "describe",
+    "split_of",
+    "write_corpus",
+]
+
 VALIDATION: Final = 0.02
-
-ExtraMembers = Callable[[Episode], Mapping[str, bytes]]
-
-
-@runtime_checkable
-class Indexed(Protocol):
-    """Episodes that can be counted and read in any order, such as a list or a corpus reader."""
-
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, i: int, /) -> Episode: ...
-
-
-Episodes = Indexed | Iterable[Episode] | Callable[[], Indexed | Iterable[Episode]]
 
 
 @dataclass(frozen=True)
@@ -93,8 +104,8 @@ def write_corpus(
     """Write one split, ``folder/config/split``, or go on where an interrupted call stopped.
 
     Args:
-        episodes: a list or anything else with ``len`` and ``[i]``; an iterable; or a function
-            without arguments that returns either.
+        episodes: a list or anything else with ``len`` and ``[i]``; a source in slices, such as
+            ``LeRobotSlices``; an iterable; or a function without arguments that returns one.
         folder: the corpus.
         config: name of the config.
         split: name of the split.
@@ -102,7 +113,7 @@ def write_corpus(
         extra: whether samples have ``extra.npy``, exact times and presence scores.
         shard_bytes: size that no shard exceeds, unless one episode alone does.
         seed: of the shuffle; None keeps the order.
-        num_procs: processes that encode; indexed episodes are read in them as well.
+        num_procs: processes that encode; indexed episodes and slices are read in them as well.
         progress: show a bar, where there is a terminal.
         extra_members: gives further members of an episode, such as ``mp4``, by name.
         shuffle_buffer: episodes that a stream is shuffled through.
@@ -124,12 +135,11 @@ def write_corpus(
             return _report(final, manifest, kept=len(manifest.shards))
         raise CorpusError(f"{final}: expected no such split yet; delete it to write it anew")
     made = episodes() if callable(episodes) else episodes
-    source = _Source(made, spec)
-    kept = work.resume(source.length)
-    source.skip(work.keys())
-    job = _Job(made if isinstance(made, Indexed) else None, spec, extra_members)
-    with closing(in_order(job, source, num_procs)) as samples:
-        _write_shards(work, samples, _bar(source, progress, len(work.keys())))
+    length = length_of(made)
+    kept = work.resume(length)
+    written = work.keys()
+    with closing(encoded_samples(made, spec, extra_members, num_procs, written)) as samples:
+        _write_shards(work, samples, _bar(length, progress, len(written)))
     return _report(final, _finish(work, final, num_procs), kept)
 
 
@@ -147,87 +157,10 @@ def split_of(uid: str, participant: str | None = None, *, validation: float = VA
     return "validation" if number < validation * 2**64 else "train"
 
 
-# ------------------------------------------------------------- what to encode
-
-
-class _Source:
-    """Iterates what is to be encoded, in the order of the split: positions, or episodes."""
-
-    def __init__(self, episodes: Indexed | Iterable[Episode], spec: ShardSpec) -> None:
-        self._indexed = episodes if isinstance(episodes, Indexed) else None
-        self.length = len(self._indexed) if self._indexed is not None else None
-        self._items: Iterator[Any]
-        if self._indexed is not None:
-            self._items = iter(_permuted(len(self._indexed), spec.seed))
-        else:
-            assert isinstance(episodes, Iterable)
-            buffered = _shuffled(episodes, spec.seed, spec.shuffle_buffer)
-            self._items = iter(episodes) if spec.seed is None else buffered
-
-    def __iter__(self) -> Iterator[Any]:
-        return self._items
-
-    def skip(self, keys: Sequence[str]) -> None:
-        """Pass over what is written already; of indexed episodes only the ends are compared."""
-        for number, key in enumerate(keys):
-            item = next(self._items, None)
-            if self._indexed is not None and item is not None:
-                ends = number in (0, len(keys) - 1)
-                got = self._indexed[item].key if ends else key
-            else:
-                got = None if item is None else item.key
-            if got != key:
-                raise CorpusError(
-                    f"episode {number} of an unfinished split: expected {key!r} as it was written, "
-                    f"got {got!r}: resume with the same episodes, or delete the .partial folder"
-                )
-
-
-def _permuted(length: int, seed: int | None) -> list[int]:
-    return Order(length, seed).permute(0, np.arange(length)).tolist()
-
-
-def _shuffled(episodes: Iterable[Episode], seed: int | None, size: int) -> Iterator[Episode]:
-    """Yield all episodes, each drawn from a buffer by a hash of (seed, number of the draw)."""
-    stream = iter(episodes)
-    buffer = list(islice(stream, size))
-    draw = 0
-    while buffer:
-        digest = hashlib.sha256(f"{seed}:{draw}".encode()).digest()
-        place = int.from_bytes(digest[:8], "big") % len(buffer)
-        buffer[place], buffer[-1] = buffer[-1], buffer[place]
-        yield buffer.pop()
-        buffer.extend(islice(stream, 1))
-        draw += 1
-
-
-@dataclass(frozen=True)
-class _Sample:
-    key: str
-    members: tuple[str, ...]
-    data: bytes
-
-
-@dataclass(frozen=True)
-class _Job:
-    """Encodes one item; travels to every process once."""
-
-    episodes: Indexed | None
-    spec: ShardSpec
-    extra_members: ExtraMembers | None
-
-    def __call__(self, item: Any) -> _Sample:
-        episode: Episode = item if self.episodes is None else self.episodes[item]
-        members = encode(episode, self.spec.format, self.spec.extra)
-        if self.extra_members is not None:
-            members.update(self.extra_members(episode))
-        return _Sample(episode.key, tuple(members), pack_sample(episode.key, members))
-
-
 # -------------------------------------------------------------- shards on disk
 
 
-def _write_shards(work: UnfinishedSplit, samples: Iterator[_Sample], bar: Any) -> None:
+def _write_shards(work: UnfinishedSplit, samples: Iterator[EncodedSample], bar: Any) -> None:
     seen = set(work.keys())
     sample = next(samples, None)
     with bar:
@@ -244,15 +177,15 @@ def _write_shards(work: UnfinishedSplit, samples: Iterator[_Sample], bar: Any) -
 def _fill(
     work: UnfinishedSplit,
     file: BinaryIO,
-    first: _Sample,
-    samples: Iterator[_Sample],
+    first: EncodedSample,
+    samples: Iterator[EncodedSample],
     seen: set[str],
     bar: Any,
-) -> _Sample | None:
+) -> EncodedSample | None:
     """Write one shard; return the sample that did not fit, or None at the end."""
     digest, size = hashlib.sha256(), 0
     keys: list[str] = []
-    sample: _Sample | None = first
+    sample: EncodedSample | None = first
     room = work.spec.shard_bytes - len(END)
     while sample is not None and (not keys or size + len(sample.data) <= room):
         _check_sample(work, sample, seen)
@@ -270,7 +203,7 @@ def _fill(
     return sample
 
 
-def _check_sample(work: UnfinishedSplit, sample: _Sample, seen: set[str]) -> None:
+def _check_sample(work: UnfinishedSplit, sample: EncodedSample, seen: set[str]) -> None:
     if sample.key in seen:
         raise CorpusError(f"key: expected every episode to have its own, got {sample.key!r} twice")
     seen.add(sample.key)
@@ -284,16 +217,46 @@ def _check_sample(work: UnfinishedSplit, sample: _Sample, seen: set[str]) -> Non
 
 def _finish(work: UnfinishedSplit, final: Path, num_procs: int) -> Manifest:
     """Make index, table, statistics and manifest from the written shards; name the split."""
-    from pyarrow import parquet
-
     if not work.shards:
         shutil.rmtree(work.folder)
         raise CorpusError(f"{final}: expected at least one episode, got none")
-    spec, stats = work.spec, CorpusStats()
+    spec = work.spec
+    draft = Manifest(
+        config=spec.config,
+        split=spec.split,
+        format=spec.format,
+        members=work.members,
+        num_frames=0,
+        shards=tuple(work.shards),
+        files=(),
+        spec=asdict(spec),
+    )
+    manifest, stats = describe(work.files, draft, num_procs)
+    write_stats(final.parent, spec.split, manifest.content, stats, work.folder)
+    write_sealed(work.files / MANIFEST, manifest.to_dict())
+    os.replace(work.files, final)
+    shutil.rmtree(work.folder)
+    return manifest
+
+
+def describe(files: Path, draft: Manifest, num_procs: int) -> tuple[Manifest, CorpusStats]:
+    """Write index and table of the shards in a folder; return its manifest and statistics.
+
+    Args:
+        files: where the shards are, all of them whole.
+        draft: the manifest but for its ``files`` and ``num_frames``, which are found here.
+        num_procs: processes that read.
+
+    """
+    from pyarrow import parquet
+
     rows: list[NDArray[np.void]] = []
-    numbers = range(len(work.shards))
-    summarised = in_order(_Summarise(work.files, spec, work.members), numbers, num_procs, 1)
-    table = work.files / EPISODES
+    halvings = _halvings(files, draft)
+    stats = CorpusStats(halvings)
+    names = tuple(shard.name for shard in draft.shards)
+    job = _Summarise(files, names, draft.members, halvings)
+    summarised = in_order(job, range(len(draft.shards)), num_procs, 1)
+    table = files / EPISODES
     with (
         closing(summarised) as summaries,
         parquet.ParquetWriter(table, episodes_schema(), compression="zstd") as writer,
@@ -302,22 +265,20 @@ def _finish(work: UnfinishedSplit, final: Path, num_procs: int) -> Manifest:
             rows.append(summary.rows)
             stats.merge(summary.stats)
             writer.write_table(summary.episodes)
-    write_rows(work.files / INDEX, np.concatenate(rows))
-    manifest = Manifest(
-        config=spec.config,
-        split=spec.split,
-        format=spec.format,
-        members=work.members,
+    write_rows(files / INDEX, np.concatenate(rows))
+    manifest = replace(
+        draft,
         num_frames=sum(int(r["num_frames"].sum()) for r in rows),
-        shards=tuple(work.shards),
-        files=tuple(record_of(work.files / name) for name in (INDEX, EPISODES)),
-        spec=asdict(spec),
+        files=tuple(record_of(files / name) for name in (INDEX, EPISODES)),
     )
-    write_stats(final.parent, spec.split, manifest.content, stats, work.folder)
-    write_sealed(work.files / MANIFEST, manifest.to_dict())
-    os.replace(work.files, final)
-    shutil.rmtree(work.folder)
-    return manifest
+    return manifest, stats
+
+
+def _halvings(files: Path, draft: Manifest) -> int:
+    """How few chunks of actions to look at, by the frames that the first shard makes expect."""
+    first = draft.shards[0]
+    frames = int(build_index(files / first.name)["num_frames"].sum())
+    return halvings_for(frames * draft.num_bytes // first.bytes)
 
 
 def _report(final: Path, manifest: Manifest, kept: int) -> CorpusReport:
@@ -335,15 +296,17 @@ def _report(final: Path, manifest: Manifest, kept: int) -> CorpusReport:
 @dataclass(frozen=True)
 class _Summarise:
     files: Path
-    spec: ShardSpec
+    shards: tuple[str, ...]
     members: tuple[str, ...]
+    halvings: int
 
     def __call__(self, number: int) -> ShardSummary:
-        return summarise(self.files / self.spec.shard_name(number), number, self.members)
+        path = self.files / self.shards[number]
+        return summarise(path, number, self.members, self.halvings)
 
 
-def _bar(source: _Source, progress: bool, done: int) -> Any:
+def _bar(length: int | None, progress: bool, done: int) -> Any:
     from tqdm import tqdm
 
-    total, disable = source.length, None if progress else True
-    return tqdm(total=total, initial=done, unit="episode", disable=disable)
+    disable = None if progress else True
+    return tqdm(total=length, initial=done, unit="episode", disable=disable)

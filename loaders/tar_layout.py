@@ -15,6 +15,7 @@ compressed: the data of a member can be memory-mapped.
 import os
 import tarfile
 from collections.abc import Iterator, Mapping
+from functools import cache
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -154,9 +155,23 @@ def map_file(path: str | os.PathLike[str]) -> Buffer:
 def _header(name: str, size: int) -> bytes:
     if len(name) > MAX_NAME:
         raise CorpusError(f"{name}: expected at most {MAX_NAME} characters, got {len(name)}")
-    info = tarfile.TarInfo(name)
-    info.size = size
-    return info.tobuf(tarfile.USTAR_FORMAT)
+    encoded, octal = name.encode("ascii"), b"%011o" % size
+    if len(octal) > 11:
+        raise CorpusError(f"{name}: expected at most 8 GiB, got {size} bytes")
+    head, total = _blank_header()
+    # The sum of all bytes, with the eight of the sum itself as spaces.
+    total += sum(encoded) + sum(octal) - 11 * ord("0")
+    name_field = encoded.ljust(MAX_NAME, b"\0")
+    return b"".join(
+        (name_field, head[MAX_NAME:124], octal, head[135:148], b"%06o\0 " % total, head[156:])
+    )
+
+
+@cache
+def _blank_header() -> tuple[bytes, int]:
+    """Return the header of an empty file without a name, and the sum that it states."""
+    head = tarfile.TarInfo("").tobuf(tarfile.USTAR_FORMAT)
+    return head, int(head[148:154], 8)
 
 
 def _entry(buffer: Buffer, at: int, where: str) -> tuple[str, str, int] | None:

@@ -58,6 +58,9 @@ def from_vitra(
     Returns:
         An episode in the video's own time, with MANO's shape numbers. A frame that is not kept has
         no hand. ``meta["text_rephrase"]`` and ``meta["vitra"]`` keep what has no field of its own.
+        For `attach`: ``native_fps`` is ``fps``; ``video_start_sec`` is when frame 0 is shown, 0
+        unless ``start_s`` says otherwise; ``undistorted`` is true, as VITRA's K is of pictures
+        whose distortion was removed. Frame numbers are (timestamps_s - video_start_sec) * fps.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -111,16 +114,15 @@ def _episode(
             "source": source or name.split("_")[0].lower(),
             "uid": str(_field(fields, "video_name")),
             "fps": fps,
+            "native_fps": float(fps),
+            "video_start_sec": float(start - frames[0] / fps),
+            "undistorted": True,
             "shape_space": "mano",
             "scale_status": "pseudo-label of VITRA, not metric ground truth",
-            "lens_status": "labels refer to the undistorted video",
             "provenance": {"annotation": "vitra", "file": path.name},
             "warnings": warnings,
             "text_rephrase": _plain(fields.get("text_rephrase", {})),
-            "vitra": {
-                **{n: _plain(fields[n]) for n in OPTIONAL_FACTS if n in fields},
-                "video_decode_frame": frames.astype(int).tolist(),
-            },
+            "vitra": {n: _plain(fields[n]) for n in OPTIONAL_FACTS if n in fields},
         },
     )
 

@@ -1,12 +1,14 @@
 """The verbs of the command line that work on the corpus: verify, convert, pack."""
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mint_hub.loaders.schema import Episode
+
+Keep = Callable[[str, str | None], bool]
 
 
 def add_verify(commands: Any) -> None:
@@ -35,9 +37,10 @@ def add_convert(commands: Any) -> None:
     parser = commands.add_parser(
         "convert",
         help="labels in other formats to corpus shards",
-        description="Write FORMAT's labels as a config of a corpus: lerobot (LeRobot v3 roots, "
-        "local or hf://), vitra (.npy annotations), hot3d (raw sequences). Interrupted, the same "
-        "command goes on. Train and validation are told apart by participant, else by video.",
+        description="Write FORMAT's labels as a config of a corpus: lerobot (LeRobot v3 roots, or "
+        "folders of them, local or hf://), vitra (.npy annotations), hot3d (raw sequences). "
+        "Interrupted at any moment, the same command goes on; what it finished is skipped. Train "
+        "and validation are told apart by participant, else by video. Withdrawn videos stay out.",
     )
     add = parser.add_argument
     add("format", choices=sorted(_READERS), help="what the sources are")
@@ -55,25 +58,30 @@ def add_convert(commands: Any) -> None:
 
 def _convert(args: argparse.Namespace) -> int:
     from mint_hub.loaders.card import write_card
+    from mint_hub.loaders.changelog import Changelog
     from mint_hub.loaders.shards import split_of, write_corpus
 
     read = _READERS[args.format]
+    origin = _origin(args)
+    withdrawn = Changelog.load(args.out)
     splits = ("train", "validation") if args.split == "auto" else (args.split,)
-    if args.split == "auto" and next(read(args), None) is None:
+    if args.split == "auto" and next(iter(read(args, _anything)), None) is None:
         raise ValueError(f"{args.sources}: expected episodes, found none")
     for split in splits:
 
-        def chosen(split: str = split) -> "Iterator[Episode]":
-            for episode in read(args):
-                if args.split != "auto" or _split(episode, split_of) == split:
-                    yield episode
+        def keep(uid: str, participant: str | None, split: str = split) -> bool:
+            if withdrawn.has(uid):
+                return False
+            return args.split != "auto" or split_of(uid, participant) == split
 
         # Reads up to the first that falls here: all of them only where none does.
-        if args.split == "auto" and next(chosen(), None) is None:
+        if args.split == "auto" and next(iter(read(args, keep)), None) is None:
             print(f"{args.config}/{split}: no episodes fall here")
             continue
+        if not _begin(args.out, args.config, split, origin):
+            continue
         report = write_corpus(
-            chosen,
+            lambda keep=keep: read(args, keep),
             args.out,
             args.config,
             split,
@@ -83,34 +91,105 @@ def _convert(args: argparse.Namespace) -> int:
             progress=not args.quiet,
         )
         print(report)
-    print(f"card: {write_card(args.out)}")
+    if args.format == "hot3d" and args.mano is None:
+        _keep_hand_annotations(args)
+    print(f"card: {_renew(args.out / 'README.md', lambda path: write_card(path.parent))}")
     return 0
 
 
-def _split(episode: "Episode", split_of: Callable[..., str]) -> str:
-    uid = episode.meta.get("uid") or episode.key
-    return split_of(str(uid), episode.meta.get("participant"))
+def _origin(args: argparse.Namespace) -> dict[str, Any]:
+    from mint_hub.loaders.conversion import INPUTS, inputs_stamp
+
+    return {
+        "verb": "convert",
+        "sources": args.sources,
+        INPUTS: inputs_stamp([*args.sources, *([args.mano] if args.mano else [])], args.out),
+        **{name: getattr(args, name) for name in ("format", "split", "lossless", "extra")},
+        "mano": args.mano is not None,
+    }
 
 
-def _read_lerobot(args: argparse.Namespace) -> "Iterator[Episode]":
-    from mint_hub.loaders.lerobot import from_lerobot
+def _begin(folder: Path, config: str, split: str, origin: dict[str, Any]) -> bool:
+    from mint_hub.loaders.conversion import begin
 
-    for root in args.sources:
-        yield from from_lerobot(root)
+    if begin(folder, config, split, origin):
+        return True
+    print(f"{config}/{split}: finished before, from the same inputs and arguments: skipped")
+    return False
 
 
-def _read_vitra(args: argparse.Namespace) -> "Iterator[Episode]":
+def _renew(path: Path, write: Callable[[Path], Path]) -> Path:
+    """Write a file that appears whole or not at all, where an earlier try may have been killed."""
+    from mint_hub.loaders.atomic import clear_left_over
+
+    clear_left_over(path)
+    return write(path)
+
+
+def _anything(_uid: str, _participant: str | None) -> bool:
+    return True
+
+
+def _kept(episodes: "Iterable[Episode]", keep: Keep) -> "Iterator[Episode]":
+    for episode in episodes:
+        uid = episode.meta.get("uid") or episode.key
+        if keep(str(uid), episode.meta.get("participant")):
+            yield episode
+
+
+def _read_lerobot(args: argparse.Namespace, keep: Keep) -> Iterable[Any]:
+    from mint_hub.loaders.lerobot import LeRobotSlices, lerobot_roots
+
+    roots = [root for place in args.sources for root in lerobot_roots(place) or [place]]
+    return LeRobotSlices(roots, keep)
+
+
+def _read_vitra(args: argparse.Namespace, keep: Keep) -> "Iterable[Episode]":
     from mint_hub.loaders.vitra import from_vitra
 
-    for path in args.sources:
-        yield from_vitra(path)
+    return _kept((from_vitra(path) for path in args.sources), keep)
 
 
-def _read_hot3d(args: argparse.Namespace) -> "Iterator[Episode]":
+def _read_hot3d(args: argparse.Namespace, keep: Keep) -> "Iterable[Episode]":
     from mint_hub.loaders.hot3d import from_hot3d
 
+    return _kept((from_hot3d(folder, mano_dir=args.mano) for folder in args.sources), keep)
+
+
+def _keep_hand_annotations(args: argparse.Namespace) -> None:
+    """Write what HOT3D says of hands that cannot be read, for those who have MANO later."""
+    from mint_hub.loaders.hot3d import hot3d_hands, hot3d_key
+
     for folder in args.sources:
-        yield from_hot3d(folder, mano_dir=args.mano)
+        path = args.out / "hand_annotations" / f"{hot3d_key(folder)}.npz"
+        print(f"hands need MANO (--mano); as annotated: {_renew(path, hot3d_hands(folder).save)}")
+
+
+def add_withdraw(commands: Any) -> None:
+    """Add `mint-hub withdraw`."""
+    parser = commands.add_parser(
+        "withdraw",
+        help="take videos out of a corpus, for good",
+        description="Take every episode of some videos out of every config of a corpus. Shards are "
+        "written anew without them; tombstones in changelog.json and on the card keep them out.",
+    )
+    parser.add_argument("folder", type=Path, help="the corpus")
+    parser.add_argument("uids", nargs="+", help="names of the videos (uid of their episodes)")
+    parser.add_argument("--reason", required=True, help="why; it is published")
+    parser.add_argument("--source", help="their data set, where two have a video of that name")
+    parser.set_defaults(verb=_withdraw)
+
+
+def _withdraw(args: argparse.Namespace) -> int:
+    from mint_hub.loaders.withdraw import withdraw
+
+    report = withdraw(args.folder, args.uids, args.reason, source=args.source)
+    for place, count in report.episodes.items():
+        gone = ", which is gone now" if place in report.removed_splits else ""
+        print(f"{count} episodes out of {place}{gone}")
+    if not report.episodes:
+        print("withdrawn before: nothing changed")
+    return 0
 
 
 def add_pack(commands: Any) -> None:
@@ -150,21 +229,34 @@ def _pack(args: argparse.Namespace) -> int:
         "egodex": resolvers.EgoDexVideos,
     }
     packer = Packer(layouts[args.layout](args.videos), size_hw=_size(args.size))
-    report = pack_corpus(
-        CorpusReader(args.corpus, args.config, args.split),
-        packer,
-        args.out,
-        args.name or f"{args.config}-video",
-        args.split,
-        on_missing="skip" if args.skip_missing else "raise",
-        num_procs=args.num_procs,
-        progress=not args.quiet,
-    )
-    print(report.corpus)
-    for key in report.missing:
+    reader = CorpusReader(args.corpus, args.config, args.split)
+    name = args.name or f"{args.config}-video"
+    origin = {
+        "verb": "pack",
+        "sources": [args.corpus, str(args.videos)],
+        "labels": reader.manifest.content,
+        "videos": str(args.videos),
+        **{option: getattr(args, option) for option in ("layout", "size", "skip_missing")},
+    }
+    if _begin(args.out, name, args.split, origin):
+        report = pack_corpus(
+            reader,
+            packer,
+            args.out,
+            name,
+            args.split,
+            on_missing="skip" if args.skip_missing else "raise",
+            num_procs=args.num_procs,
+            progress=not args.quiet,
+        )
+        print(report.corpus)
+    packed = CorpusReader(args.out, name, args.split)
+    there = {packed.key(i) for i in range(len(packed))}
+    missing = [key for key in map(reader.key, range(len(reader))) if key not in there]
+    for key in missing:
         print(f"left out, no video: {key}")
-    print(f"card: {write_card(args.out)}")
-    return 1 if report.missing else 0
+    print(f"card: {_renew(args.out / 'README.md', lambda path: write_card(path.parent))}")
+    return 1 if missing else 0
 
 
 def _size(text: str | None) -> tuple[int, int] | None:
@@ -176,8 +268,9 @@ def _size(text: str | None) -> tuple[int, int] | None:
     return int(parts[0]), int(parts[1])
 
 
-_READERS: dict[str, Callable[[argparse.Namespace], "Iterator[Episode]"]] = {
+_READERS: dict[str, Callable[[argparse.Namespace, Keep], Iterable[Any]]] = {
     "hot3d": _read_hot3d,
     "lerobot": _read_lerobot,
     "vitra": _read_vitra,
 }
+"""From arguments and a law of (uid, participant) to episodes, or to slices of them."""

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import yaml
 
-from mint_hub.loaders.card import write_card
+from mint_hub.loaders.card import FACTS_BEGIN, FACTS_END, write_card
+from mint_hub.loaders.changelog import Changelog, Tombstone
 from mint_hub.loaders.shards import write_corpus
 from mint_hub.loaders.tar_layout import CorpusError
 from tests.episodes import make_episode
@@ -53,3 +55,46 @@ def test_errors_teach(tmp_path, corpus):
         write_card(tmp_path / "empty")
     with pytest.raises(CorpusError, match=r"expected one of \['exact', 'small'\], got 'big'"):
         write_card(corpus, default="big")
+
+
+def test_facts_are_renewed_and_words_around_them_stay(corpus):
+    path = write_card(corpus)
+    before, _, rest = path.read_text().partition(FACTS_BEGIN)
+    path.write_text(f"{before}\nMy words.\n{FACTS_BEGIN}{rest}\nMore of mine.\n")
+    write_corpus([make_episode(25, seed=9, key="e-9")], corpus, "new", "train")
+    text = write_card(corpus).read_text()
+    assert "| new | train | compact | 1 | 25 |" in text
+    assert text.count(FACTS_BEGIN) == text.count(FACTS_END) == 1
+    assert text.index("My words.") < text.index(FACTS_BEGIN) < text.index("More of mine.")
+
+
+def test_default_that_was_chosen_stays(corpus):
+    write_card(corpus, default="small")
+    data = yaml.safe_load(write_card(corpus).read_text().split("---\n")[1])
+    assert [c["config_name"] for c in data["configs"] if c.get("default")] == ["small"]
+
+
+def test_statistics_say_where_hands_are(corpus):
+    episodes = [make_episode(20 + i, seed=i, key=f"e-{i}") for i in range(3)]
+    depth = np.concatenate([e.hand_state[e.presence[:, 0], 0, 2] for e in episodes])
+    share = np.concatenate([e.presence[:, 0] for e in episodes]).mean()
+    text = write_card(corpus).read_text()
+    row = next(r for r in text.splitlines() if r.startswith("| small | train | synthetic | left |"))
+    assert f"| {share:.1%} |" in row
+    middle = float(row.split("|")[-2].split("/")[1])
+    assert middle == pytest.approx(np.median(depth), abs=0.01)
+
+
+def test_withdrawn_videos_are_named_in_a_persons_text_too(corpus):
+    (corpus / "README.md").write_text("# Mine\n")
+    Changelog((), (Tombstone("s", "u", "2026-01-31", "why", {"small/train": 1}),)).save(corpus)
+    text = write_card(corpus).read_text()
+    assert "# Mine\n" in text
+    assert "| 2026-01-31 | s | u | small/train: 1 | why |" in text
+    assert write_card(corpus).read_text() == text
+
+
+def test_statistics_of_other_shards_are_refused(corpus):
+    (corpus / "small/stats.json").unlink()
+    with pytest.raises(CorpusError, match=r"stats\.json: expected this file, got none"):
+        write_card(corpus)

@@ -11,13 +11,25 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
+from mint_hub.cli import main
 from mint_hub.conventions import LEFT, RIGHT, SIDES
 from mint_hub.geometry import hand_state as hands
 from mint_hub.geometry import rigid
 from mint_hub.geometry.hand_model import HandModel
 from mint_hub.geometry.lenses import Lens
 from mint_hub.geometry.mano_files import MANO_FILE_NAMES
-from mint_hub.loaders.hot3d import ARIA_STREAMS, from_hot3d
+from mint_hub.loaders.hot3d import (
+    ARIA_STREAMS,
+    HANDS_UNAVAILABLE,
+    from_hot3d,
+    hot3d_hands,
+    hot3d_key,
+)
+from mint_hub.loaders.hot3d_hands import Hot3DHands
+from mint_hub.loaders.index import read_episodes
+from mint_hub.loaders.location import corpus_files
+from mint_hub.loaders.members import META, decode, encode
+from mint_hub.loaders.reader import CorpusReader
 from mint_hub.loaders.schema import Episode
 from tests.geometry.test_mano_files import mano_fields, write_mano
 
@@ -40,21 +52,24 @@ def mano_dir(tmp_path_factory) -> Path:
     return write_mano(tmp_path_factory.mktemp("m") / "mano", mano_fields(0), mano_fields(1))
 
 
-def test_the_sequence_is_read_whole(episode):
-    assert episode.key == "hot3d-aria-p0003_c701bd11-214-1"
+def test_the_sequence_is_read_whole(episode, folder):
+    assert episode.key == "hot3d-aria-p0003_c701bd11-214-1" == hot3d_key(folder)
     assert episode.num_frames == 34
     assert_allclose(np.diff(episode.timestamps_s), 1 / 30, atol=1e-4)
     assert episode.fps == pytest.approx(30, abs=0.05)
     assert episode.image_size_hw == (1408, 1408)
     assert episode.meta["participant"] == "P0003"
     assert "metric" in episode.meta["scale_status"]
-    assert episode.meta["hot3d"]["mask_hand_visible"] == [True] * 34
+    assert hot3d_hands(folder).masks["mask_hand_visible"].tolist() == [True] * 34
+    assert episode.meta["native_fps"] == episode.fps
+    assert episode.meta["video_start_sec"] == 0
+    assert episode.meta["undistorted"] is True
     assert episode.path_length_m < 0.05
 
 
 @pytest.mark.filterwarnings("ignore:shape numbers")
 def test_without_mano_joints_are_unavailable_and_the_raw_annotation_is_kept(episode, folder):
-    assert episode.meta["joints_available"] is False
+    assert episode.meta["quality"] == {"hands": HANDS_UNAVAILABLE}
     assert any("joints unavailable" in w and "mano_dir" in w for w in episode.meta["warnings"])
     assert not episode.presence.any()
     assert np.isnan(episode.joints_camera()).all()
@@ -62,14 +77,68 @@ def test_without_mano_joints_are_unavailable_and_the_raw_annotation_is_kept(epis
     assert_array_equal(episode.hand_state, hands.absent((34, 2)))
     with (folder / "mano_hand_pose_trajectory.jsonl").open() as file:
         first = json.loads(next(file))["hand_poses"]
-    kept = episode.meta["hot3d"]
+    kept = hot3d_hands(folder)
+    assert kept.there.all()
+    assert_allclose((kept.timestamps_ns - kept.timestamps_ns[0]) / 1e9, episode.timestamps_s)
     for hand in (LEFT, RIGHT):
         raw = first[str(hand)]
-        assert kept["pca"][0][hand] == raw["pose"]
-        assert kept["transl_world_m"][0][hand] == raw["wrist_xform"]["t_xyz"]
+        assert kept.pca[0, hand].tolist() == raw["pose"]
+        assert kept.transl[0, hand].tolist() == raw["wrist_xform"]["t_xyz"]
         w, *xyz = raw["wrist_xform"]["q_wxyz"]
-        assert kept["orientation_world_quat_xyzw"][0][hand] == [*xyz, w]
-        assert kept["betas"][0][hand] == raw["betas"]
+        assert kept.quat_xyzw[0, hand].tolist() == [*xyz, w]
+        assert kept.betas[0, hand].tolist() == raw["betas"]
+
+
+def test_the_record_says_so_in_few_bytes_also_when_cut(episode, folder):
+    members = encode(episode, extra=True)
+    assert len(members[META]) < 2600
+    back = decode(members).window(5, 9)
+    assert back.meta["quality"] == {"hands": HANDS_UNAVAILABLE}
+    cut = hot3d_hands(folder).window(back.meta["window_start"], back.num_frames)
+    assert_allclose(cut.timestamps_ns / 1e9, back.meta["source_timestamps_s"], rtol=0, atol=1e-9)
+
+
+def test_the_annotation_is_kept_in_a_file_of_its_own(folder, tmp_path):
+    made = hot3d_hands(folder).window(3, 7)
+    path = made.save(tmp_path / "a.npz")
+    back = Hot3DHands.load(path)
+    for name in ("timestamps_ns", "there", "pca", "transl", "quat_xyzw", "betas"):
+        assert_array_equal(getattr(back, name), getattr(made, name))
+        assert getattr(back, name).dtype == getattr(made, name).dtype
+    assert back.masks.keys() == made.masks.keys() == {"mask_hand_visible", "mask_good_exposure"}
+    assert back.save(tmp_path / "b.npz").read_bytes() == path.read_bytes()
+    with pytest.raises(ValueError, match="0 <= start <= 7 - length"):
+        made.window(3, 7)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(ValueError, match=r"a\.npz: expected a whole npz file"):
+        Hot3DHands.load(path)
+    np.savez(tmp_path / "c.npz", there=made.there)
+    with pytest.raises(ValueError, match=r"c\.npz: expected timestamps_ns.*got \['there'\]"):
+        Hot3DHands.load(tmp_path / "c.npz")
+
+
+@pytest.mark.filterwarnings("ignore:shape numbers")
+def test_converted_to_shards_with_and_without_mano(episode, folder, mano_dir, tmp_path, capsys):
+    def convert(config, *more):
+        call = ["convert", "hot3d", str(folder), "-o", str(tmp_path), "--config", config]
+        assert main([*call, "--split", "train", "--extra", "--quiet", *more]) == 0
+        return CorpusReader(tmp_path, config)
+
+    (back,) = convert("bare")
+    assert back.meta == episode.meta
+    assert not back.presence.any()
+    table = read_episodes(tmp_path / "bare/train", ["quality"])
+    assert json.loads(table["quality"][0].as_py()) == {"hands": HANDS_UNAVAILABLE}
+    kept = Hot3DHands.load(tmp_path / f"hand_annotations/{episode.key}.npz")
+    assert_array_equal(kept.pca, hot3d_hands(folder).pca)
+    assert_array_equal(kept.transl, hot3d_hands(folder).transl)
+    (whole,) = convert("whole", "--mano", str(mano_dir), "--lossless")
+    assert whole.presence.all()
+    expected = from_hot3d(folder, mano_dir=mano_dir)
+    assert_array_equal(whole.hand_state, expected.hand_state)
+    assert main(["verify", str(tmp_path), "--full"]) == 0
+    assert set(corpus_files("bare", tmp_path).splits) == {"train"}
+    capsys.readouterr()
 
 
 def boxes(folder: Path, stream: str) -> list[tuple[int, int, np.ndarray]]:
@@ -91,12 +160,12 @@ def test_hands_project_into_their_published_boxes(folder, stream, at_least):
     """Headset pose, extrinsics, lens and hand poses together, against independent numbers."""
     episode = from_hot3d(folder, stream, upright=False)
     lens = Lens.from_dict(episode.meta["lens"])
-    kept = episode.meta["hot3d"]
+    kept = hot3d_hands(folder, stream)
     found = boxes(folder, stream)
     assert len(found) >= at_least
     for frame, hand, (x0, x1, y0, y1) in found:
         j0 = ABOUT_J0_M * ([-1, 1, 1] if hand == LEFT else 1)
-        wrist = np.array(kept["transl_world_m"][frame][hand]) + j0
+        wrist = kept.transl[frame, hand] + j0
         (u, v) = lens.project(rigid.transform_points(episode.T_camera_from_world[frame], wrist))
         assert x0 - 15 < u < x1 + 15
         assert y0 - 15 < v < y1 + 15
@@ -112,7 +181,7 @@ def test_upright_is_the_same_camera_turned(folder, episode):
     x, y, z = rigid.transform_points(raw.T_camera_from_world[5], point)
     assert_allclose(rigid.transform_points(episode.T_camera_from_world[5], point), [-y, x, z])
     # Upright, the left hand is on the left, and both hands are below the middle.
-    transl = np.array(episode.meta["hot3d"]["transl_world_m"])
+    transl = hot3d_hands(folder).transl
     camera = rigid.transform_points(episode.T_camera_from_world, transl)
     assert (camera[:, LEFT, 0] < camera[:, RIGHT, 0]).all()
     assert (camera[..., 1] > 0).all()
@@ -127,12 +196,12 @@ def test_with_mano_files_the_hands_equal_smplx_on_the_published_numbers(folder, 
     import smplx
 
     episode = from_hot3d(folder, mano_dir=mano_dir)
-    assert episode.meta["joints_available"] is True
+    assert "quality" not in episode.meta
     assert not episode.meta["warnings"]
     assert episode.presence.all()
-    kept, hand = episode.meta["hot3d"], SIDES.index(side)
-    transl = np.array([row[hand] for row in kept["transl_world_m"]])
-    orient = Rotation.from_quat([row[hand] for row in kept["orientation_world_quat_xyzw"]])
+    kept, hand = hot3d_hands(folder), SIDES.index(side)
+    transl = kept.transl[:, hand]
+    orient = Rotation.from_quat(kept.quat_xyzw[:, hand])
     model = smplx.MANO(
         str(mano_dir / MANO_FILE_NAMES[side]),
         is_rhand=side == "right",
@@ -143,9 +212,9 @@ def test_with_mano_files_the_hands_equal_smplx_on_the_published_numbers(folder, 
         batch_size=34,
     )
     out = model(
-        betas=torch.tensor([row[hand] for row in kept["betas"]], dtype=torch.float64),
+        betas=torch.from_numpy(kept.betas[:, hand]),
         global_orient=torch.from_numpy(orient.as_rotvec()),
-        hand_pose=torch.tensor([row[hand] for row in kept["pca"]], dtype=torch.float64),
+        hand_pose=torch.from_numpy(kept.pca[:, hand]),
         transl=torch.from_numpy(transl),
     )
     world = out.joints.detach().numpy()[:, :16]
@@ -159,7 +228,7 @@ def test_the_right_file_alone_mirrors_the_left_basis(folder, tmp_path):
     alone = write_mano(tmp_path / "mano", mano_fields(0), None)
     with pytest.warns(UserWarning, match="MANO_LEFT"):
         episode = from_hot3d(folder, mano_dir=alone)
-    pca = np.array(episode.meta["hot3d"]["pca"])
+    pca = hot3d_hands(folder).pca
     fields = mano_fields(0)
     rotvec = fields["hands_mean"] + pca[0, LEFT] @ fields["hands_components"][:15]
     stored = hands.unpack(episode.hand_state[0, LEFT]).joint_rotations()
@@ -196,7 +265,7 @@ def test_masks_decide_on_frames_and_hands(copy, mano_dir):
     episode = from_hot3d(copy, mano_dir=mano_dir)
     assert_array_equal(episode.presence[:3], [[False, False], [True, True], [True, True]])
     assert_array_equal(episode.hand_state[0], hands.absent((2,)))
-    assert episode.meta["hot3d"]["pca"][0] == [None, None]
+    assert not hot3d_hands(copy).there[0].any()
 
 
 def test_a_hand_that_is_not_annotated_is_absent(copy, mano_dir):

@@ -474,7 +474,7 @@ def test_segments_are_cut_to_the_episode_and_it_says_so(tmp_path):
     replace_column(path, "atomic_segments", pa.array([[segment]]))
     (episode,) = read(tmp_path)
     assert [(s.start, s.end) for s in episode.text] == [(6, 12)]
-    assert episode.meta["warnings"] == ["atomic segment 0: frames 6 to 30 of 12 were cut"]
+    assert episode.meta["warnings"][0] == "atomic segment 0: frames 6 to 30 of 12 were cut"
 
 
 def test_image_size_is_needed_and_can_be_given(tmp_path):

@@ -399,7 +399,7 @@ ENTRY_DEFECTS = [
     ({"schema_version": True}, "schema_version: expected integer, got True"),
     ({"surprise": 1}, "json surprise: expected an entry of the schema, got an unknown name"),
     ({"format": "zip"}, "json format: expected compact or lossless, got 'zip'"),
-    ({"num_frames": 23}, r"traj\.npy: expected 23 frames, got 24"),
+    ({"num_frames": 23, "meta": {}}, r"traj\.npy: expected 23 frames, got 24"),
     ({"num_frames": 0}, "json num_frames: expected a positive number, got 0"),
     ({"fps": -30.0}, "json fps: expected a positive number, got -30.0"),
     ({"start_s": None}, "json start_s: expected number, got None"),
