@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mint_hub import cli_corpus
+from mint_hub import cli_corpus, cli_evaluate, cli_label, cli_synth
 from mint_hub._version import __version__
 
 if TYPE_CHECKING:
@@ -53,6 +53,11 @@ def _parser() -> argparse.ArgumentParser:
     cli_corpus.add_verify(commands)
     cli_corpus.add_convert(commands)
     cli_corpus.add_pack(commands)
+    cli_synth.add_synth(commands)
+    cli_corpus.add_withdraw(commands)
+    cli_label.add_label(commands)
+    cli_evaluate.add_evaluate(commands)
+    cli_evaluate.add_compare(commands)
     return parser
 
 

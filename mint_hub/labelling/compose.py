@@ -95,9 +95,14 @@ def quality(clip: Clip) -> dict[str, Any]:
     residual = clip.hands.residual_px[observed & np.isfinite(clip.hands.residual_px)]
     return {
         "camera_solved": round(float(clip.camera.solved.mean()), 4),
-        "camera_residual_px": round(float(clip.camera.residual_px), 4),
-        "covisible_min": round(float(clip.camera.covisible.min()), 1),
+        "camera_residual_px": _number(clip.camera.residual_px, 4),
+        "covisible_min": _number(clip.camera.covisible.min(), 1),
         "hands_observed": [round(float(v), 4) for v in observed.mean(axis=0)],
         "hands_filled": [round(float(v), 4) for v in clip.hands.filled.mean(axis=0)],
-        "hands_residual_px": round(float(np.median(residual)), 3) if residual.size else None,
+        "hands_residual_px": _number(np.median(residual), 3) if residual.size else None,
     }
+
+
+def _number(value: Any, digits: int) -> float | None:
+    """A number as JSON has it: None where the backend does not tell (NaN)."""
+    return round(float(value), digits) if np.isfinite(value) else None

@@ -22,6 +22,7 @@ from mint_hub.labelling.runner import Executor, InProcess, Run
 from mint_hub.labelling.stage import lost_seconds
 from mint_hub.loaders.atomic import replacing
 from mint_hub.loaders.card import write_card
+from mint_hub.loaders.changelog import Changelog
 from mint_hub.loaders.integrity import verify
 from mint_hub.loaders.schema import Episode
 from mint_hub.loaders.shards import CorpusReport, split_of, write_corpus
@@ -264,12 +265,12 @@ class _Books:
                 report.done.append(key)
         report.hours_kept = report.hours_in - sum(report.hours_lost.values())
 
-    def episode_files(self, source: str) -> dict[str, list[Path]]:
+    def episode_files(self, source: str, withdrawn: Changelog) -> dict[str, list[Path]]:
         """By split, the files of all episodes of a source's finished videos, in order."""
         files: dict[str, list[Path]] = {}
         for path in sorted(self.folder.glob(f"videos/*/{ACCOUNT}")):
             account = json.loads(path.read_text())
-            if account["source"] == source:
+            if account["source"] == source and not withdrawn.has(account["uid"], source):
                 names = [path.parent / "episodes" / f"{key}.npz" for key in account["episodes"]]
                 files.setdefault(split_of(account["uid"]), []).extend(names)
         return files
@@ -328,7 +329,7 @@ def _write_shards(
     books: _Books, out: Path, config: str, report: LabelReport, *, progress: bool
 ) -> None:
     """Write the splits whose episodes changed, the card, and verify all of it."""
-    by_split = books.episode_files(config)
+    by_split = books.episode_files(config, Changelog.load(out))
     for split, paths in by_split.items():
         if not paths:
             continue

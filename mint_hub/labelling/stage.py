@@ -8,8 +8,9 @@ no other state between calls than workers they may have started (`close` ends th
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Protocol, runtime_checkable
+from dataclasses import dataclass, fields, is_dataclass, replace
+from pathlib import PurePath
+from typing import Any, Final, Protocol, runtime_checkable
 
 from mint_hub.labelling.records import Clip, Lost, StageReport, Video
 
@@ -112,9 +113,19 @@ def reported(clip: Clip, report: StageReport, **changes: Any) -> Clip:
     return replace(clip, **changes, reports=(*clip.reports, report))
 
 
+LOCAL: Final = {"local": True}
+"""Metadata of a settings field that says where something is on this machine."""
+
+
 def plain(settings: Any) -> dict[str, Any]:
-    """Return a settings dataclass as plain JSON."""
-    return json.loads(json.dumps(asdict(settings), default=str))
+    """Return a settings dataclass as plain JSON; LOCAL fields by their last part only."""
+    values: dict[str, Any] = {}
+    for f in fields(settings):
+        value = getattr(settings, f.name)
+        if f.metadata.get("local"):
+            value = PurePath(value).name
+        values[f.name] = plain(value) if is_dataclass(value) else value
+    return json.loads(json.dumps(values, default=str))
 
 
 def report_of(stage: Stage, **numbers: Any) -> StageReport:

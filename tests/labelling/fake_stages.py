@@ -104,9 +104,7 @@ class Invent:
             source="fake",
             residual_px=np.ones((frames, 2), np.float32),
         )
-        camera = CameraPath(
-            T, np.ones(frames, bool), np.full(frames, 200, np.float32), 0.5, "fake"
-        )
+        camera = CameraPath(T, np.ones(frames, bool), np.full(frames, 200, np.float32), 0.5, "fake")
         report = StageReport(self.stage, self.backend, self.version)
         changes = {"camera": camera, "hands": hands, "intrinsics": Intrinsics((1.0, 1.2), "x", 1)}
         return Outcome((reported(clip, report, **changes),))
