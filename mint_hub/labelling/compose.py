@@ -1,13 +1,14 @@
 """From the last clip record to the record of the project: `Episode`."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from mint_hub._version import __version__
 from mint_hub.geometry import hand_state
-from mint_hub.labelling.records import Clip, Scale, Video
+from mint_hub.labelling.records import Clip, Scale, StageReport, Video
 from mint_hub.labelling.stage import StageError
 from mint_hub.loaders.schema import Episode
 
@@ -55,7 +56,7 @@ def episode_of(clip: Clip, video: Video) -> Episode:
         "quality": quality(clip),
         "provenance": {
             "file": video.path.name,
-            "stages": [asdict(report) for report in (*video.reports, *clip.reports)],
+            "stages": [_told(report) for report in (*video.reports, *clip.reports)],
             "scale": None if clip.scale is None else asdict(clip.scale),
         },
     }
@@ -75,6 +76,13 @@ def episode_of(clip: Clip, video: Video) -> Episode:
         text=clip.text,
         meta=meta,
     )
+
+
+def _told(report: StageReport) -> dict[str, Any]:
+    """A report without the places of this machine that later stages needed."""
+    here = {k for k, v in report.numbers.items() if isinstance(v, str) and Path(v).is_absolute()}
+    kept = {k: v for k, v in report.numbers.items() if k not in here}
+    return asdict(replace(report, numbers=kept))
 
 
 def scale_words(scale: Scale | None) -> str:
