@@ -290,10 +290,11 @@ def _draw_chips(image: Image, episode: Episode, k: int) -> None:
     for hand, side in enumerate(SIDES):
         scores = episode.presence_score
         there = bool(episode.presence[k, hand])
+        filled = episode.filled is not None and bool(episode.filled[k, hand])
         words = [
             side,
-            "" if there else "absent",
-            "" if scores is None else f"{scores[k, hand]:.2f}",
+            "filled" if filled else "" if there else "absent",
+            "" if scores is None or filled else f"{scores[k, hand]:.2f}",
         ]
         canvas.chip(
             image,

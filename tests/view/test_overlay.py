@@ -96,6 +96,17 @@ def test_absent_hands_change_no_pixel_but_the_chips(episode, mesh):
     np.testing.assert_array_equal(draw_overlay(GREY, elsewhere, 2, mesh=mesh), drawn)
 
 
+def test_a_bridged_hand_says_so_in_its_chip(episode):
+    filled = np.zeros((16, 2), bool)
+    filled[2, 0] = True
+    changed = _changed(
+        draw_overlay(GREY, replace(episode, filled=filled), 2), draw_overlay(GREY, episode, 2)
+    )
+    assert changed[:, :160].any()
+    assert not changed[:, 160:].any()
+    assert not changed[BETWEEN_CHIPS].any()
+
+
 def test_the_image_given_is_not_drawn_on(episode):
     image = GREY.copy()
     draw_overlay(image, episode, 0, mesh=True)
