@@ -3,22 +3,29 @@
 import argparse
 from pathlib import Path
 
-from mint_hub.cards.dataset import render
+from mint_hub.cards import dataset, model
 from mint_hub.loaders.atomic import replacing
 from mint_hub.loaders.card import CARD
 
 
 def main() -> None:
-    """Write ``dataset_card/README.md``; ends with one line where its sources are wrong."""
+    """Write both cards' ``README.md``; ends with one line where a source is wrong.
+
+    A checkout without ``model_card`` has the dataset's alone.
+    """
     parser = argparse.ArgumentParser(prog="python -m mint_hub.cards", description=__doc__)
     parser.add_argument("checkout", type=Path, nargs="?", default=Path(), help="default: here")
-    folder: Path = parser.parse_args().checkout / "dataset_card"
-    try:
-        card = render(folder)
-    except ValueError as error:
-        raise SystemExit(str(error)) from None
-    with replacing(folder / CARD) as temporary:
-        temporary.write_text(card, encoding="utf-8")
+    checkout: Path = parser.parse_args().checkout
+    renderings = {"dataset_card": dataset.render}
+    if (checkout / "model_card").is_dir():
+        renderings["model_card"] = model.render
+    for name, render in renderings.items():
+        try:
+            card = render(checkout / name)
+        except ValueError as error:
+            raise SystemExit(str(error)) from None
+        with replacing(checkout / name / CARD) as temporary:
+            temporary.write_text(card, encoding="utf-8")
 
 
 if __name__ == "__main__":

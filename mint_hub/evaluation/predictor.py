@@ -1,0 +1,255 @@
+"""Where predictions come from: a checkpoint that is run, or labels that lie in a folder.
+
+Predictions of a checkpoint are kept under a name made of the weights, the clip and the options, so
+that a second evaluation runs nothing that the first one did.
+"""
+
+import hashlib
+import json
+import resource
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mint_hub.conventions import MODEL_FPS
+from mint_hub.evaluation.bench_shards import is_corpus, label_files
+from mint_hub.evaluation.clips import BenchmarkError, Clip, MissingFilesError
+from mint_hub.geometry.hand_model import HandModel
+from mint_hub.loaders.atomic import replacing
+from mint_hub.loaders.reader import CorpusReader
+from mint_hub.loaders.schema import Episode
+
+if TYPE_CHECKING:
+    from mint_hub.inference.runner import MintRunner, RunSettings
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A clip's prediction, and what making it took; no seconds where it was not made now."""
+
+    episode: Episode
+    seconds: float | None = None
+    peak_bytes: int | None = None
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """What is evaluated, in words that travel to other processes.
+
+    Attributes:
+        what: folder of labels (saved episodes, or a corpus), or folder or hub id of a checkpoint.
+        name: what tables call it.
+        kind: "labels" or "checkpoint".
+        settings: of a checkpoint's run; None for the usual ones.
+        device: a checkpoint's; None for the best here.
+        dtype: a checkpoint's.
+        revision: of a hub repository.
+        mano_dir: folder with the user's MANO files.
+        cache_dir: where predictions are kept.
+
+    """
+
+    what: str
+    name: str
+    kind: str
+    settings: "RunSettings | None" = None
+    device: str | None = None
+    dtype: str = "auto"
+    revision: str | None = None
+    mano_dir: str | None = None
+    cache_dir: str | None = None
+
+    @classmethod
+    def of(cls, what: str, name: str | None = None, **options: Any) -> "Predictor":
+        """Look at what lies there: labels are told by their files.
+
+        Raises:
+            MissingFilesError: a local path with nothing at it.
+
+        """
+        folder = Path(what).expanduser()
+        if not folder.is_dir() and (what.startswith((".", "/", "~")) or folder.exists()):
+            raise MissingFilesError(
+                f"{what}: expected a folder with a checkpoint or labels, found none"
+            )
+        labels = folder.is_dir() and (is_corpus(folder) or any(folder.rglob("*.npz")))
+        if folder.is_dir() and not labels and not (folder / "config.json").is_file():
+            raise MissingFilesError(
+                f"{what}: expected a checkpoint (config.json), saved episodes (.npz) or a corpus, "
+                "found neither"
+            )
+        kind = "labels" if labels else "checkpoint"
+        return cls(what, name or folder.name or what, kind, **options)
+
+    def open(self) -> "OpenPredictor":
+        """Load it, in the process that uses it."""
+        return OpenLabels(self) if self.kind == "labels" else OpenCheckpoint(self)
+
+
+class OpenPredictor:
+    """A predictor whose files are open."""
+
+    hand_model: HandModel | None = None
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What the results say of it."""
+        raise NotImplementedError
+
+    def predict(self, clip: Clip) -> Prediction:
+        """Predict a clip.
+
+        Raises:
+            BenchmarkError: there is no prediction of it, or there are no pictures to make one from.
+
+        """
+        raise NotImplementedError
+
+
+class OpenLabels(OpenPredictor):
+    """Labels by key."""
+
+    def __init__(self, spec: Predictor) -> None:
+        folder = Path(spec.what).expanduser()
+        self._spec, self._where = spec, dict[str, Any]()
+        if is_corpus(folder):
+            for path in sorted(folder.glob("*/*/shards.json")):
+                reader = CorpusReader(folder, path.parent.parent.name, path.parent.name)
+                self._where |= {reader.key(i): (reader, i) for i in range(len(reader))}
+        else:
+            self._where |= label_files(folder)
+        if spec.mano_dir is not None:
+            self.hand_model = HandModel.default(spec.mano_dir)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Name, kind and how many there are."""
+        return {"name": self._spec.name, "kind": "labels", "episodes": len(self._where)}
+
+    def predict(self, clip: Clip) -> Prediction:
+        """Read the labels of a clip; those of a whole clip serve its windows."""
+        place, key = self._where.get(clip.key), clip.key
+        start = 0
+        if place is None:
+            key, number = clip.whole
+            place, start = self._where.get(key), number
+        if place is None:
+            raise MissingFilesError(
+                f"{self._spec.what}: expected labels of {clip.key}, found none (of "
+                f"{len(self._where)} episodes, the first is {min(self._where)})"
+            )
+        episode = Episode.load(place) if isinstance(place, Path) else place[0][place[1]]
+        if key != clip.key:
+            episode = episode.window(start, clip.truth.num_frames)
+        return Prediction(episode)
+
+
+class OpenCheckpoint(OpenPredictor):
+    """A model that is run on pictures, and the cache of what it said."""
+
+    def __init__(self, spec: Predictor) -> None:
+        self._spec = spec
+        if spec.mano_dir is not None:
+            self.hand_model = HandModel.default(spec.mano_dir)
+
+    @cached_property
+    def _runner(self) -> "MintRunner":
+        import torch
+
+        from mint_hub.inference.devices import available_device, available_devices
+        from mint_hub.inference.runner import MintRunner
+        from mint_hub.model.modeling_mint import MintModel
+        from mint_hub.model.processing_mint import MintProcessor
+
+        spec = self._spec
+        model = MintModel.from_pretrained(spec.what, dtype=spec.dtype, revision=spec.revision)
+        device = available_device(spec.device or available_devices()[0])
+        torch.nn.Module.to(model.eval(), device)
+        return MintRunner([model], MintProcessor.for_config(model.config), self.hand_model)
+
+    @cached_property
+    def weights_hash(self) -> str:
+        """16 hex digits of all weights and the configuration."""
+        import torch
+
+        model = self._runner.models[0]
+        config = {k: v for k, v in model.config.to_dict().items() if k != "_name_or_path"}
+        digest = hashlib.blake2b(json.dumps(config, sort_keys=True, default=str).encode())
+        for name, weight in sorted(model.state_dict().items()):
+            plain = weight.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy()
+            digest.update(f"{name} {tuple(weight.shape)} {weight.dtype}".encode())
+            digest.update(np.ascontiguousarray(plain).data)
+        return digest.hexdigest()[:16]
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Name, weights, settings and device."""
+        model = self._runner.models[0]
+        settings = self._settings(MODEL_FPS).resolved(model.config.window)
+        return {
+            "name": self._spec.name,
+            "kind": "checkpoint",
+            "weights": self.weights_hash,
+            "parameters": int(sum(p.numel() for p in model.parameters())),
+            "revision": getattr(model.config, "_commit_hash", None) or self._spec.revision,
+            "device": str(model.device),
+            "dtype": str(model.dtype).removeprefix("torch."),
+            "settings": asdict(settings),
+        }
+
+    def predict(self, clip: Clip) -> Prediction:
+        """Run the model on a clip, or read what it said before."""
+        if clip.frames is None:
+            raise MissingFilesError(
+                f"{clip.key}: no pictures to run a model on: {clip.without_frames}"
+            )
+        path = self._cached(clip)
+        if path is not None and path.is_file():
+            return Prediction(Episode.load(path))
+        images = np.stack(list(clip.frames.images()))
+        if len(images) != clip.truth.num_frames:
+            raise BenchmarkError(
+                f"{clip.key}: expected {clip.truth.num_frames} pictures, as the truth has, got "
+                f"{len(images)}"
+            )
+        begun = time.perf_counter()
+        made = self._runner.run(images, self._settings(clip.truth.fps), key=clip.key)
+        seconds = time.perf_counter() - begun
+        if path is not None:
+            with replacing(path) as temporary:
+                made.save(temporary)
+        return Prediction(made, seconds, _peak_bytes(self._runner.models[0].device.type))
+
+    def _settings(self, fps: float) -> "RunSettings":
+        from mint_hub.inference.runner import RunSettings
+
+        return replace(self._spec.settings or RunSettings(), fps=fps)
+
+    def _cached(self, clip: Clip) -> Path | None:
+        if self._spec.cache_dir is None:
+            return None
+        model = self._runner.models[0]
+        settings = asdict(self._settings(clip.truth.fps).resolved(model.config.window))
+        options: Mapping[str, Any] = settings | {
+            "dtype": str(model.dtype),
+            "device": model.device.type,
+        }
+        words = json.dumps([self.weights_hash, clip.stamp(), options], sort_keys=True, default=str)
+        name = hashlib.sha256(words.encode()).hexdigest()[:32]
+        return Path(self._spec.cache_dir) / "predictions" / name[:2] / f"{name}.npz"
+
+
+def _peak_bytes(device: str) -> int:
+    """Peak memory so far: of the device, or of this process."""
+    if device == "cuda":
+        import torch
+
+        return int(torch.cuda.max_memory_allocated())
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return int(peak * (1 if sys.platform == "darwin" else 1024))

@@ -1,0 +1,170 @@
+"""Answers that need no model; a number is only good beside theirs.
+
+- ``mean hand``: the training set's mean hands at their mean places, each there as often as in
+  training, by lot.
+- ``always present``: the same hands, both there in every frame.
+- ``zero camera motion``: the camera stays where it was in the first frame; hands as above.
+- ``last frame copied``: the truth, one frame late. No answer without a model could be this good;
+  it shows how little a slow clip asks.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mint_hub.assets import read_asset
+from mint_hub.geometry import hand_state as hands
+from mint_hub.geometry.rotations import mean_rotation
+from mint_hub.loaders.atomic import replacing
+from mint_hub.loaders.schema import Episode
+
+MEAN_HAND_FILE: Final = "mean_hand.json"
+TRIVIAL: Final = ("mean hand", "always present", "zero camera motion", "last frame copied")
+
+
+@dataclass(frozen=True)
+class MeanHand:
+    """What a training set says before any picture is seen.
+
+    Attributes:
+        trained_on: which set, in words.
+        frames: how many of them.
+        hand_state: (2, 109) mean hand of each side; rotations are means on SO(3).
+        presence_rate: (2,) share of frames with the hand.
+        fov_vh_rad: (2,) mean field of view.
+        shape_space: of the shape numbers.
+
+    """
+
+    trained_on: str
+    frames: int
+    hand_state: list[list[float]]
+    presence_rate: list[float]
+    fov_vh_rad: list[float]
+    shape_space: str
+
+    @classmethod
+    def of(cls, episodes: Iterable[Episode], trained_on: str, step: int = 10) -> "MeanHand":
+        """Average every ``step``-th frame.
+
+        Raises:
+            ValueError: no frame with a left hand, or none with a right one.
+
+        """
+        kept = list(episodes)
+        states = np.concatenate([e.hand_state[::step].astype(float) for e in kept])
+        there = np.concatenate([e.presence[::step] for e in kept])
+        fov = np.concatenate([e.fov_vh_rad[::step].astype(float) for e in kept])
+        if not there.any(axis=0).all():
+            raise ValueError(f"{trained_on}: expected frames with each hand, got none with one")
+        mean: list[list[float]] = []
+        for hand in range(2):
+            own = hands.unpack(states[there[:, hand], hand])
+            packed = hands.HandState.from_matrices(
+                np.asarray(own.translation).mean(axis=0),
+                np.asarray(mean_rotation(own.orientation())),
+                np.asarray(mean_rotation(own.joint_rotations())),
+                np.asarray(own.shape_params).mean(axis=0),
+            ).pack()
+            mean.append(np.asarray(packed, float).round(6).tolist())
+        return cls(
+            trained_on,
+            len(states),
+            mean,
+            there.mean(axis=0).round(4).tolist(),
+            fov.mean(axis=0).round(6).tolist(),
+            str(kept[0].meta.get("shape_space", "mint")),
+        )
+
+    @classmethod
+    def load(cls, path: Path | None = None) -> "MeanHand":
+        """Read what ``save`` wrote; without a path, what comes with mint-hub.
+
+        Raises:
+            ValueError: not such a file.
+
+        """
+        data = read_asset(MEAN_HAND_FILE) if path is None else path.read_bytes()
+        try:
+            made = cls(**json.loads(data))
+            made.state()
+            return made
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"{path or MEAN_HAND_FILE}: expected a mean hand, got {error}"
+            ) from None
+
+    def save(self, path: Path) -> Path:
+        """Write it as JSON."""
+        with replacing(path) as temporary:
+            temporary.write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
+        return path
+
+    def state(self) -> NDArray[np.float32]:
+        """(2, 109) hand states."""
+        state = np.asarray(self.hand_state, np.float32)
+        if state.shape != (2, hands.HAND_STATE_SIZE):
+            raise ValueError(f"hand_state: expected (2, 109), got {state.shape}")
+        return state
+
+
+def trivial_predictions(truth: Episode, mean: MeanHand) -> dict[str, Episode]:
+    """Return the answers of TRIVIAL for a clip, as episodes."""
+    count = truth.num_frames
+    seed = int.from_bytes(hashlib.sha256(truth.key.encode()).digest()[:8], "little")
+    by_lot = np.random.default_rng(seed).random((count, 2)) < mean.presence_rate
+    still = np.tile(np.eye(4), (count, 1, 1))
+    always = _constant(truth, mean, np.ones((count, 2), bool), still)
+    return {
+        "mean hand": _constant(truth, mean, by_lot, still),
+        "always present": always,
+        "zero camera motion": always,
+        "last frame copied": _late(truth),
+    }
+
+
+def _constant(
+    truth: Episode,
+    mean: MeanHand,
+    presence: NDArray[np.bool_],
+    T_camera_from_world: NDArray[np.float64],
+) -> Episode:
+    count = truth.num_frames
+    state = np.where(presence[..., None], mean.state(), hands.absent((count, 2)))
+    return replace(
+        truth,
+        T_camera_from_world=T_camera_from_world,
+        fov_vh_rad=np.tile(np.asarray(mean.fov_vh_rad, np.float32), (count, 1)),
+        hand_state=state.astype(np.float32),
+        presence=presence,
+        presence_score=None,
+        filled=None,
+        text=(),
+        meta=_meta(truth, mean.shape_space),
+    )
+
+
+def _late(truth: Episode) -> Episode:
+    """The truth of the frame before; the first frame has its own."""
+    before = np.maximum(np.arange(truth.num_frames) - 1, 0)
+    return replace(
+        truth,
+        T_camera_from_world=truth.T_camera_from_world[before],
+        fov_vh_rad=truth.fov_vh_rad[before],
+        hand_state=truth.hand_state[before],
+        presence=truth.presence[before],
+        presence_score=None,
+        filled=None,
+        text=(),
+        meta=_meta(truth, str(truth.meta.get("shape_space", "mint"))),
+    )
+
+
+def _meta(truth: Episode, shape_space: str) -> dict[str, Any]:
+    return {"source": "trivial", "fps": truth.fps, "shape_space": shape_space}

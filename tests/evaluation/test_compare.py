@@ -1,0 +1,85 @@
+"""Comparisons are paired: what differs is found, what does not is not, and names are kept."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mint_hub.evaluation.clips import Source
+from mint_hub.evaluation.compare import compare
+from mint_hub.evaluation.evaluate import evaluate
+from mint_hub.evaluation.predictor import Predictor
+from mint_hub.evaluation.results import Results, ResultsError
+from tests.evaluation_data import moved, noisy, save_all, true_episode
+
+COUNT = 12
+
+
+@pytest.fixture(scope="module")
+def sides(tmp_path_factory):
+    """Results of labels 3 cm off, and of better ones, 1 cm off; both with some noise."""
+    folder = tmp_path_factory.mktemp("compare")
+    truth = [true_episode(i, 30) for i in range(COUNT)]
+    source = Source("labels", str(save_all(truth, folder / "truth")))
+    made: dict[str, Results] = {}
+    for name, metres in (("far", 0.03), ("near", 0.01)):
+        labels = [moved(noisy(e, 0.002, seed=i), metres) for i, e in enumerate(truth)]
+        made[name] = evaluate(source, Predictor.of(str(save_all(labels, folder / name))))
+    return made
+
+
+def by_name(comparison):
+    return {d.name: d for d in comparison.differences}
+
+
+def test_the_better_side_is_found_with_interval_and_test(sides):
+    found = by_name(compare(sides["far"], sides["near"]))
+    wrist = found["CT-p"]
+    assert wrist.better == "B"
+    assert wrist.b - wrist.a == pytest.approx(-0.02, abs=1e-3)
+    assert wrist.low <= wrist.b - wrist.a <= wrist.high < 0
+    assert wrist.p == pytest.approx(2 / 2**COUNT)
+    assert wrist.p_holm >= wrist.p
+    assert found["MPJPE-p"].better == ""
+    swapped = by_name(compare(sides["near"], sides["far"]))["CT-p"]
+    assert (swapped.a, swapped.b, swapped.better) == (wrist.b, wrist.a, "A")
+
+
+def test_a_side_against_itself_differs_in_nothing(sides):
+    for difference in compare(sides["near"], sides["near"]).differences:
+        assert difference.a == difference.b
+        assert difference.better == ""
+        assert np.isnan(difference.p)
+
+
+def test_only_shared_clips_count_and_the_rest_is_told(sides):
+    some = replace(sides["near"], clips=sides["near"].clips[2:])
+    found = compare(sides["far"], some)
+    assert (found.clips, found.only_a, found.only_b) == (COUNT - 2, 2, 0)
+    assert "2 clips only of A" in found.markdown()
+
+
+def test_few_clips_have_no_p_value(sides):
+    few = [replace(r, clips=r.clips[:3]) for r in (sides["far"], sides["near"])]
+    assert all(np.isnan(d.p) for d in compare(*few).differences)
+
+
+def test_table_and_file(sides, tmp_path):
+    found = compare(sides["far"], sides["near"])
+    assert "| CT-p (m) | 0.030 | 0.010 |" in found.markdown()
+    values = json.loads(found.save(tmp_path / "c.json").read_text())
+    assert values["clips"] == COUNT
+    assert {d["name"] for d in values["differences"]} >= {"CT-p", "ATE mean", "W-MPJPE"}
+
+
+def test_what_cannot_be_compared_is_said(sides):
+    other = replace(sides["near"], clips=())
+    with pytest.raises(ResultsError, match="expected the row 'prediction'"):
+        compare(sides["far"], other)
+    renamed = tuple(replace(c, key=f"x-{c.key}") for c in sides["near"].clips)
+    with pytest.raises(ResultsError, match="got none in common"):
+        compare(sides["far"], replace(sides["near"], clips=renamed))
+    cut = tuple(replace(c, frames=29) for c in sides["near"].clips)
+    with pytest.raises(ResultsError, match="expected the same frames, got 30 in A and 29 in B"):
+        compare(sides["far"], replace(sides["near"], clips=cut))

@@ -1,0 +1,158 @@
+"""What people read: tables, the page, pictures; published numbers stay apart."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mint_hub.evaluation.benchmarks import open_benchmark
+from mint_hub.evaluation.clips import Source
+from mint_hub.evaluation.evaluate import evaluate
+from mint_hub.evaluation.figures import (
+    Bar,
+    bar_chart,
+    pair_figure,
+    path_figure,
+    strata_figure,
+    worst_frame,
+)
+from mint_hub.evaluation.predictor import Predictor
+from mint_hub.evaluation.published import published_tables
+from mint_hub.evaluation.report import worst_clips, write_report
+from mint_hub.evaluation.tables import all_tables, published
+from mint_hub.evaluation.trivial import TRIVIAL
+from mint_hub.geometry.metrics import HAND_MEASURES
+from mint_hub.loaders.clips import encode_clip
+from mint_hub.loaders.packing import MP4
+from mint_hub.loaders.shards import write_corpus
+from tests.evaluation_data import moved, noisy, save_all, true_episode
+
+
+def grey_clip(episode):
+    height, width = (side // 8 * 2 for side in episode.image_size_hw)
+    pictures = [np.full((height, width, 3), 90, np.uint8)] * episode.num_frames
+    return {MP4: encode_clip(pictures, fps=episode.fps)}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A packed corpus as truth, labels of it that are off, and the results."""
+    folder = tmp_path_factory.mktemp("report")
+    truth = [true_episode(i, 30) for i in range(4)]
+    write_corpus(
+        truth,
+        folder / "corpus",
+        "c",
+        "validation",
+        format="lossless",
+        extra=True,
+        extra_members=grey_clip,
+    )
+    labels = [moved(noisy(e, 0.004), 0.02 * (i + 1)) for i, e in enumerate(truth)]
+    source = Source("shards", str(folder / "corpus"))
+    predictor = Predictor.of(str(save_all(labels, folder / "labels")), "off <b>")
+    return source, predictor, evaluate(source, predictor)
+
+
+def test_every_table_has_the_trivial_rows(made):
+    _, _, results = made
+    tables = {t.title: t for t in all_tables(results)}
+    hands = tables["Hands in the camera frame"]
+    assert hands.columns[:3] == ("FAcc", "Recall", "F1")
+    assert len(hands.columns) == len(HAND_MEASURES)
+    found = {name for table in tables.values() for name, _ in table.rows}
+    assert set(TRIVIAL) <= found
+    for title, table in tables.items():
+        if not title.startswith("By stratum"):
+            assert table.kinds.count("ours") == 1
+            assert table.kinds.count("trivial") >= 2
+
+
+def test_page_opens_offline_and_says_what_is_whose(made, tmp_path):
+    source, predictor, results = made
+    hot3d = replace(results, benchmark={**results.benchmark, "published": "hot3d"})
+    path = write_report(hot3d, tmp_path, source, predictor, worst=2)
+    page = path.read_text()
+    assert "off &lt;b&gt;" in page
+    assert "<b>&lt;" not in page.replace("off &lt;b&gt;", "")
+    assert not re.findall(r'(?:src|href)="(?!data:)', page)
+    assert page.count('class="worst"') == 2
+    assert page.index("Hands in the camera frame") < page.index("Published numbers, not run here")
+    box = page[page.index('<div class="theirs">') :]
+    assert "WiLoR" in box
+    assert "WiLoR" not in page[: page.index('<div class="theirs">')]
+    assert "direction disputed" in box
+    text = (tmp_path / "tables.md").read_text()
+    assert text.index("## Published numbers (not run here)") < text.index("WiLoR")
+    assert len(list((tmp_path / "figures").glob("*.png"))) >= 4
+    assert (tmp_path / "results.json").is_file()
+
+
+def test_page_without_a_prediction_shows_the_trivial_rows(made, tmp_path):
+    source, _, _ = made
+    results = evaluate(source)
+    page = write_report(results, tmp_path, source, worst=1).read_text()
+    assert results.rows == TRIVIAL
+    assert "no prediction on" in page
+    assert page.count('class="worst"') == 1
+
+
+def test_worst_clips_come_first(made):
+    _, _, results = made
+    keys = [clip.key for clip in worst_clips(results, 10)]
+    assert len(keys) == 4
+    assert keys[0] == "clip-3"
+    assert len(worst_clips(results, 2)) == 2
+
+
+def test_truth_and_prediction_are_drawn_side_by_side(made):
+    source, predictor, results = made
+    key = worst_clips(results, 1)[0].key
+    clip = next(c for c in open_benchmark(source) if c.key == key)
+    predicted = predictor.open().predict(clip).episode
+    frame = worst_frame(clip, predicted)
+    image = pair_figure(clip, predicted, frame, None)
+    half = (image.shape[1] - 6) // 2
+    left, right = image[:, :half], image[:, half + 6 :]
+    assert left.shape == right.shape
+    assert (left != right).any()
+    same = pair_figure(clip, clip.truth, frame, None)
+    assert (same[:, :half] == same[:, half + 6 :]).all()
+    paths = path_figure(clip, predicted)
+    assert paths.shape == (360, 360, 3)
+    assert len(np.unique(paths.reshape(-1, 3), axis=0)) > 3
+
+
+def test_bars_are_as_high_as_their_values():
+    groups = [("a", [Bar("x", 1.0)]), ("b", [Bar("x", 2.0)]), ("c", [Bar("x", float("nan"))])]
+    color = (10, 200, 30)
+    image = bar_chart("t", "mm", groups, [], {"x": color})
+    inside = (np.abs(image.astype(int) - color).max(axis=-1) < 8).sum(axis=0)
+    heights = np.sort(np.unique(inside[inside > 5]))
+    assert heights[-1] == pytest.approx(2 * heights[0], abs=4)
+
+
+def test_a_stratum_without_bins_has_no_picture(made):
+    assert strata_figure(made[2], "hidden share", "EPE-p", "px") is None
+    assert strata_figure(made[2], "wrist depth", "EPE-p", "px") is not None
+
+
+def test_published_numbers_have_a_source_and_our_columns():
+    tables = published_tables()
+    assert len(tables) == 9
+    for key, table in tables.items():
+        assert table.source
+        if key.endswith("camera"):
+            assert "Arc-length ratio (direction disputed)" in table.columns
+            assert "true / predicted" in table.note
+    hands = {m.name for m in HAND_MEASURES}
+    assert set(tables["hot3d hands"].columns) <= hands
+    mint = dict(tables["hot3d hands"].rows)["MINT"]
+    assert mint[:4] == (0.945, 0.983, 0.953, 29.926)
+    assert dict(tables["arctic camera"].rows)["MINT"] == (3.392, 3.372, 0.256, 0.251, 1.412)
+    assert set(published_tables("arctic")) == {"arctic hands", "arctic camera"}
+
+
+def test_no_published_table_where_the_benchmark_is_not_theirs(made):
+    assert published(made[2]) == []
