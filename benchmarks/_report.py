@@ -16,6 +16,8 @@ from statistics import median
 from time import perf_counter
 from typing import Any
 
+from mint_hub._version import __version__
+
 RESULTS = Path(__file__).parent / "results"
 
 
@@ -30,7 +32,8 @@ def machine_facts() -> dict[str, Any]:
         "load_average_1m": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        **{name: _version(name) for name in ("numpy", "torch", "transformers", "mint-hub")},
+        **{name: _version(name) for name in ("numpy", "torch", "transformers")},
+        "mint-hub": __version__,
         "threads": {
             name: os.environ[name]
             for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")

@@ -19,6 +19,8 @@ A step counts (mask true) where the hand is present at both its ends ("anchor": 
 k + 1) and k + 1 is a frame of the episode. Hence the last frame has no action; VITRA's own code
 marks a zero step as valid there. What does not count is zero.
 
+``action_dataset`` gives them to a torch training loop, with pictures and text.
+
 Source: VITRA (arXiv 2510.21571) and its released code.
 """
 

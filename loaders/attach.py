@@ -40,12 +40,22 @@ FPS_TOLERANCE = 0.005
 DURATION_TOLERANCE_S = 0.5
 """Between what the labels say of the whole video and what the file says."""
 
+_GIVE_LENS = "give lens=, or lens=None if the file is undistorted"
 _SLACK_S = 1e-3
 """Containers round times to a millisecond."""
 
 
 class VideoMismatchError(VideoError):
-    """A file that is not the video that was labelled, or lacks some of its frames."""
+    """A file that is not the video that was labelled, or lacks some of its frames.
+
+    Attributes:
+        check: which of CHECKS refused it; None where a frame is missing.
+        fact: the message without advice to callers.
+
+    """
+
+    check: Check | None = None
+    fact: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +226,7 @@ class VideoAttachment:
             self._check_duration()
         if "lens" not in ignore and video.undistorted and no_lens:
             want = "a lens, as these labels refer to undistorted pictures"
-            self._refuse("lens", want, "none; give lens=, or lens=None if the file is undistorted")
+            self._refuse("lens", want, "none", _GIVE_LENS)
 
     def _check_duration(self) -> None:
         video, info = self.reference, self.info
@@ -246,11 +256,13 @@ class VideoAttachment:
                 f"{1e3 * error.max():.1f} ms off (episode {self.reference.key})"
             )
 
-    def _refuse(self, check: Check, expected: str, got: str) -> None:
-        raise VideoMismatchError(
-            f"{self.info.source}: {check}: expected {expected}, got {got} "
-            f"(episode {self.reference.key}); if you know better, ignore={{{check!r}}}"
-        )
+    def _refuse(self, check: Check, expected: str, got: str, advice: str = "") -> None:
+        fact = f"{self.info.source}: {check}: expected {expected}, got {got}"
+        fact = f"{fact} (episode {self.reference.key})"
+        advice = advice or f"if you know better, ignore={{{check!r}}}"
+        error = VideoMismatchError(f"{fact}; {advice}")
+        error.check, error.fact = check, fact
+        raise error
 
 
 def _warp(spec: Any, image_size_hw: tuple[int, int]) -> Rectification | None:

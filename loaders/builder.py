@@ -19,9 +19,10 @@ from mint_hub.loaders.derived import VIDEO_COLUMN, VIDEO_MEMBER, episode_feature
 from mint_hub.loaders.fields import ARRAY_FIELDS
 from mint_hub.loaders.hub import NAME
 from mint_hub.loaders.lerobot import from_lerobot
-from mint_hub.loaders.location import CONFIGS, SAMPLE, Shard, corpus_files
+from mint_hub.loaders.location import ALL, CONFIGS, PARTS, SAMPLE, Shard, corpus_files
 from mint_hub.loaders.manifest import ShardRecord
 from mint_hub.loaders.members import decode
+from mint_hub.loaders.participants import group_of
 from mint_hub.loaders.schema import Episode, EpisodeError
 from mint_hub.loaders.shards import split_of
 from mint_hub.loaders.tar_layout import Buffer, CorpusError, map_file, samples_in
@@ -61,7 +62,7 @@ class MintEgo(datasets.GeneratorBasedBuilder):
         if config_name is None:
             warnings.warn(
                 f"{NAME}: reading the embedded {SAMPLE!r}, one synthetic episode; the corpus is "
-                f'load_dataset("{NAME}", "all"), its parts are {", ".join(CONFIGS[2:])}',
+                f'load_dataset("{NAME}", "{ALL}"), its parts are {", ".join(PARTS)}',
                 stacklevel=4,
             )
             config_name = SAMPLE
@@ -129,10 +130,12 @@ def episode_of(row: Mapping[str, Any]) -> Episode:
 
     """
     values = {name: row[name] for name in ("key", "image_size_hw", "text", "meta") if name in row}
-    if "text" in values and not isinstance(values["text"], list):
-        raise EpisodeError(
-            f"text: expected a row in the plain format, with_format(None), got {type(row['text'])}"
-        )
+    for name in ("image_size_hw", "text"):
+        if name in values and not isinstance(values[name], list | tuple):
+            raise EpisodeError(
+                f"{name}: expected a row in the plain format, with_format(None), got "
+                f"{type(row[name])}"
+            )
     if isinstance(values.get("meta"), str):
         values["meta"] = json.loads(values["meta"])
     for spec in ARRAY_FIELDS:
@@ -181,6 +184,5 @@ def _lerobot_rows(root: Shard, token: Any) -> Iterator[dict[str, Any]]:
     """Read the episodes of a LeRobot root that belong to a split by the law of ``split_of``."""
     options = {"token": token} if root.url.startswith("hf://") else None
     for episode in from_lerobot(root.url, storage_options=options):
-        uid, participant = episode.meta.get("uid"), episode.meta.get("participant")
-        if split_of(uid or episode.key, participant) == root.split:
+        if split_of(*group_of(episode.meta, episode.key)) == root.split:
             yield row_of(episode)

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from mint_hub.loaders.atomic import clear_left_over
 from mint_hub.loaders.manifest import read_manifest, read_sealed, write_sealed
-from mint_hub.loaders.tar_layout import CorpusError
+from mint_hub.loaders.tar_layout import SUFFIX, CorpusError
 
 INPUTS: Final = "inputs"
 _TIMES: Final = ("mtime", "LastModified", "last_modified", "created")
@@ -38,13 +38,13 @@ def begin(
         False where the split is finished and was written from the same origin.
 
     Raises:
-        CorpusError: it is finished, or begun, from another origin, or nothing says from which;
-            names both.
+        CorpusError: it is finished, or has finished shards, from another origin, or nothing says
+            from which; names both.
 
     """
     final = Path(folder) / config / split
     partial, note = final.with_name(f".{split}.partial"), final.with_name(f".{split}.origin.json")
-    finished, begun = final.exists(), (partial / "files").exists()
+    finished, begun = final.exists(), any((partial / "files").glob(f"*{SUFFIX}"))
     if finished or begun:
         _compare(final if finished else partial, note, origin, required=finished)
     if finished and not partial.exists():

@@ -186,6 +186,15 @@ def checked_key(value: object) -> str:
     return value
 
 
+def slug(name: str) -> str:
+    """Return a name in characters that keys may have, never empty: others become '-'.
+
+    >>> slug("P01/videos (take 2)")
+    'p01-videos-take-2'
+    """
+    return re.sub(r"[^a-z0-9_-]+", "-", name.lower()).strip("-") or "x"
+
+
 def checked_size(value: object) -> tuple[int, int]:
     """Return (height, width), both positive."""
     if not isinstance(value, tuple | list | np.ndarray) or len(value) != 2:

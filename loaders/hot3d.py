@@ -19,7 +19,6 @@ The images are fisheye, Aria's lie on their side. The episode is that of the rec
 """
 
 import json
-import re
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -32,7 +31,9 @@ from mint_hub.geometry import hand_state as hands
 from mint_hub.geometry import rigid
 from mint_hub.geometry.camera import K_to_fov_vh
 from mint_hub.geometry.lenses import Fisheye624Lens, Lens
+from mint_hub.loaders.fields import slug
 from mint_hub.loaders.hot3d_hands import Hot3DHands
+from mint_hub.loaders.participants import participant_of
 from mint_hub.loaders.schema import Episode
 from mint_hub.loaders.trajectory_files import (
     csv_cells,
@@ -41,6 +42,8 @@ from mint_hub.loaders.trajectory_files import (
 )
 
 Float = NDArray[np.float64]
+
+SOURCE: Final = "hot3d"
 
 ARIA_STREAMS: Final = {
     "214-1": ("camera-rgb", (1408, 1408)),
@@ -99,10 +102,9 @@ def from_hot3d(
     if mano_dir is not None:
         state, presence = annotated.states(T_camera_from_world, Path(mano_dir)), annotated.there
     about = _about(folder)
-    meta = {
-        "source": "hot3d",
+    meta: dict[str, Any] = {
+        "source": SOURCE,
         "uid": about["recording_name"],
-        "participant": about["participant_id"],
         "stream": stream,
         "scale_status": "metric, motion capture",
         "shape_space": "mano",
@@ -113,6 +115,8 @@ def from_hot3d(
         "provenance": {"annotation": "hot3d", "first_timestamp_ns": int(stamps[0])},
         "warnings": [],
     }
+    if "participant_id" in about:
+        meta["participant"] = about["participant_id"]
     if mano_dir is None:
         meta["quality"] = {"hands": HANDS_UNAVAILABLE}
         meta["warnings"] = [_unavailable(annotated.there)]
@@ -143,14 +147,14 @@ def hot3d_hands(folder: str | PathLike[str], stream: str = "214-1") -> Hot3DHand
 
     """
     _, stamps = _stamps(Path(folder), stream)
-    return _annotated(Path(folder), stream, stamps)
+    uid = _about(Path(folder))["recording_name"]
+    return replace(_annotated(Path(folder), stream, stamps), uid=uid)
 
 
 def hot3d_key(folder: str | PathLike[str], stream: str = "214-1") -> str:
     """Return the key of an episode that is given none: of headset, recording and stream."""
     about = _about(Path(folder))
-    name = f"hot3d-{about['headset']}-{about['recording_name']}-{stream}".lower()
-    return re.sub(r"[^a-z0-9_-]", "-", name)
+    return slug(f"hot3d-{about['headset']}-{about['recording_name']}-{stream}")
 
 
 def _stamps(folder: Path, stream: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -284,16 +288,21 @@ def _at(path: Path, stream: str, stamps: NDArray[np.int64]) -> NDArray[np.bool_]
 
 
 def _about(folder: Path) -> dict[str, str]:
-    """Headset, participant and recording: from metadata.json, else from the folder's name."""
-    known = {"headset": "unknown", "participant_id": "unknown", "recording_name": folder.name}
+    """Headset, participant and recording: from metadata.json, else from the folder's name.
+
+    Of a folder called otherwise than HOT3D's are, nobody knows the participant: there is none.
+    """
     path = folder / "metadata.json"
     if not path.is_file():
-        return known
+        person = participant_of(SOURCE, folder.name)
+        said = {} if person is None else {"participant_id": person}
+        return {"headset": "unknown", "recording_name": folder.name, **said}
+    names = ("headset", "participant_id", "recording_name")
     try:
-        return {name: str(json.loads(path.read_text("utf-8"))[name]) for name in known}
+        return {name: str(json.loads(path.read_text("utf-8"))[name]) for name in names}
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
-            f"{path}: expected {', '.join(known)}, got {type(error).__name__}: {error}"
+            f"{path}: expected {', '.join(names)}, got {type(error).__name__}: {error}"
         ) from None
 
 

@@ -44,6 +44,7 @@ class Hot3DHands:
         quat_xyzw: (T, 2, 4) orientation of the wrist.
         betas: (T, 2, 10) MANO's shape numbers.
         masks: HOT3D's own masks of these frames by name (mask_...), each (T,) bool.
+        uid: name of the recording, ``meta["uid"]`` of its episodes.
 
     """
 
@@ -54,6 +55,7 @@ class Hot3DHands:
     quat_xyzw: Float
     betas: Float
     masks: dict[str, NDArray[np.bool_]] = field(default_factory=dict[str, NDArray[np.bool_]])
+    uid: str = ""
 
     @property
     def num_frames(self) -> int:
@@ -117,11 +119,13 @@ class Hot3DHands:
         require_window(start, length, self.num_frames)
         part = slice(start, start + length)
         arrays = {name: getattr(self, name)[part] for name in _ARRAYS}
-        return Hot3DHands(**arrays, masks={name: m[part] for name, m in self.masks.items()})
+        masks = {name: mask[part] for name, mask in self.masks.items()}
+        return Hot3DHands(**arrays, masks=masks, uid=self.uid)
 
     def save(self, path: str | PathLike[str]) -> Path:
         """Write one ``.npz`` of plain arrays, named as the attributes; equal hands, equal bytes."""
-        return write_arrays({n: getattr(self, n) for n in _ARRAYS} | self.masks, Path(path))
+        arrays = {name: np.asarray(getattr(self, name)) for name in (*_ARRAYS, _UID)}
+        return write_arrays(arrays | self.masks, Path(path))
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> "Hot3DHands":
@@ -137,9 +141,11 @@ class Hot3DHands:
         except EpisodeError as error:
             raise EpisodeError(f"{path}: {error}") from None
         masks = {name: arrays.pop(name) for name in list(arrays) if name.startswith("mask_")}
-        if sorted(arrays) != sorted(_ARRAYS):
-            raise EpisodeError(f"{path}: expected {', '.join(_ARRAYS)}, got {sorted(arrays)}")
-        return cls(**arrays, masks=masks)  # pyright: ignore[reportArgumentType]
+        if arrays.keys() != {*_ARRAYS, _UID}:
+            expected = ", ".join((*_ARRAYS, _UID))
+            raise EpisodeError(f"{path}: expected {expected}, got {sorted(arrays)}")
+        uid = str(arrays.pop(_UID))
+        return cls(**arrays, masks=masks, uid=uid)  # pyright: ignore[reportArgumentType]
 
     def states(self, T_camera_from_world: Float, mano_dir: Path) -> Float:
         """Hand states (T, 2, 109) in the camera frame; absent where not annotated.
@@ -170,7 +176,8 @@ class Hot3DHands:
         return state
 
 
-_ARRAYS: Final = tuple(f.name for f in fields(Hot3DHands) if f.name != "masks")
+_UID: Final = "uid"
+_ARRAYS: Final = tuple(f.name for f in fields(Hot3DHands) if f.name not in ("masks", _UID))
 
 
 def _check_hand(index: str, hand: Mapping[str, Any], num_coefficients: int) -> None:

@@ -1,9 +1,10 @@
 """Is a corpus what was written? Every file that is not, and every episode lost with it, by name.
 
 ``verify(folder, "size")`` hashes the small files, compares the sizes of shards and looks at the
-first and last header and the end of each: that finds what is missing, cut, grown or swapped.
-``"full"`` reads everything and finds any changed bit. A damaged shard is always read, to say which
-episodes are lost: those whose crc32 is no longer that of ``episodes.parquet``.
+first and last header and the end of each: that finds what is missing, cut, grown or swapped, but no
+bit that changed within a shard. ``"full"`` reads everything and finds any changed bit. A damaged
+shard is always read, to say which episodes are lost: those whose crc32 is no longer that of
+``episodes.parquet``. What lies beside the shards (``beside``) is looked at as well.
 """
 
 import os
@@ -14,6 +15,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+from mint_hub.loaders.beside import annotation_files, read_annotation
+from mint_hub.loaders.changelog import CHANGELOG, Changelog
 from mint_hub.loaders.index import read_episodes
 from mint_hub.loaders.manifest import (
     EPISODES,
@@ -150,6 +153,7 @@ def verify(folder: str | os.PathLike[str], level: Level = "size") -> Report:
     for config in sorted(known | {path.parent for path in (*splits, *_unfinished(root))}):
         files += _config_reports(root, config)
     files += [FileReport(_name(p, root), "unfinished", _HOW_TO_GO_ON) for p in _unfinished(root)]
+    files += _beside_reports(root)
     if not files:
         raise CorpusError(f"{root}: expected a corpus, a config or a split, got none")
     return Report(root, level, tuple(files))
@@ -191,6 +195,29 @@ def _config_reports(root: Path, config: Path) -> Iterator[FileReport]:
     for split in sorted(known.keys() - {path.name for path in config.iterdir()}):
         if not (config / f".{split}.partial").exists():
             yield FileReport(_name(config / split, root), "missing", f"{name} knows this split")
+
+
+def _beside_reports(root: Path) -> Iterator[FileReport]:
+    """Changelog and hand annotations: whole, and none of a withdrawn video."""
+    withdrawn = Changelog()
+    if (root / CHANGELOG).exists():
+        try:
+            withdrawn = Changelog.load(root)
+        except CorpusError as error:
+            yield FileReport(CHANGELOG, "checksum", str(error))
+        else:
+            yield FileReport(CHANGELOG, "ok")
+    for path in annotation_files(root):
+        name = _name(path, root)
+        try:
+            read = read_annotation(path)
+        except CorpusError as error:
+            yield FileReport(name, "checksum", str(error))
+            continue
+        if withdrawn.has(read.uid, read.source):
+            yield FileReport(name, "extra", f"the video {read.uid!r} is withdrawn: delete it")
+        else:
+            yield FileReport(name, "ok")
 
 
 def _manifest_of(split: Path) -> Manifest | None:

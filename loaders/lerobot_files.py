@@ -4,11 +4,13 @@ Parquet is read by row groups and by columns, so that a remote root needs no cop
 bounded by one row group.
 """
 
+import hashlib
 import json
 import os
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -19,6 +21,7 @@ from mint_hub.loaders.lerobot_columns import Column, LeRobotError
 INFO: Final = "meta/info.json"
 TASKS: Final = "meta/tasks.parquet"
 EPISODES: Final = "meta/episodes"
+DATA: Final = "data"
 DATA_PATH: Final = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH: Final = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 
@@ -43,6 +46,42 @@ class Root:
     def name(self, relative: str) -> str:
         """Return a file's address, for messages."""
         return f"{self.address.rstrip('/')}/{relative}"
+
+    @cached_property
+    def identity(self) -> str:
+        """Eight hexadecimal digits that tell this root from others, wherever it lies.
+
+        They follow from info.json, from the sizes of the files of meta/episodes, and from the
+        footers of the first of these and of the first data file, which sum their columns up: not
+        from what a user may leave out or add, later data files and videos.
+
+        Raises:
+            LeRobotError: one of these files is no parquet file.
+
+        """
+        digest = hashlib.sha256(json.dumps(self.info, sort_keys=True).encode())
+        for folder in (EPISODES, DATA):
+            found: dict[str, Any] = self.filesystem.find(f"{self.folder}/{folder}", detail=True)
+            sizes = {
+                name[name.index(f"/{folder}/") + 1 :]: int(entry["size"])
+                for name, entry in found.items()
+                if name.endswith(".parquet")
+            }
+            if folder == EPISODES:
+                digest.update(json.dumps(sizes, sort_keys=True).encode())
+            if sizes:
+                digest.update(self._footer(*min(sizes.items())))
+        return digest.hexdigest()[:8]
+
+    def _footer(self, relative: str, size: int) -> bytes:
+        """Return the end of a parquet file, from where its metadata begins."""
+        place = f"{self.folder}/{relative}"
+        end: bytes = self.filesystem.cat_file(place, start=max(size - 8, 0), end=size)
+        length = int.from_bytes(end[:4], "little")
+        if end[4:] != b"PAR1" or length + 8 > size:
+            raise LeRobotError(f"{self.name(relative)}: expected a parquet file, got a damaged one")
+        footer: bytes = self.filesystem.cat_file(place, start=size - 8 - length, end=size)
+        return footer
 
     @contextmanager
     def parquet(self, relative: str) -> Generator[Any]:

@@ -8,15 +8,13 @@ a second copy nor more memory than a single file.
 import json
 import logging
 import os
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mint_hub.geometry.camera import fov_vh_to_K
-from mint_hub.loaders import lerobot_codec, lerobot_files, lerobot_text
+from mint_hub.loaders import lerobot_codec, lerobot_files
 from mint_hub.loaders.lerobot_columns import (
     EXTRA,
     Column,
@@ -25,31 +23,16 @@ from mint_hub.loaders.lerobot_columns import (
     columns_of,
     dialect_of,
 )
-from mint_hub.loaders.lerobot_files import Root, RowBatch, Span, open_root, read_tasks
-from mint_hub.loaders.lerobot_index import INDEX_COLUMNS, check_spans, episode_index
-from mint_hub.loaders.lerobot_origin import (
-    ATTACHMENT,
-    ORIGIN_COLUMNS,
-    VIDEO_KEY,
-    attachment,
-    origin_warnings,
-    stated_uid,
-    video_uid,
-)
-from mint_hub.loaders.schema import SCHEMA_VERSION, Episode, EpisodeError
+from mint_hub.loaders.lerobot_files import Root, RowBatch, Span, open_root
+from mint_hub.loaders.lerobot_index import check_spans, episode_index
+from mint_hub.loaders.lerobot_meta import SCALE_STATUS, RootMeta
+from mint_hub.loaders.lerobot_origin import ORIGIN_COLUMNS
+from mint_hub.loaders.participants import group_of
+from mint_hub.loaders.schema import Episode, EpisodeError
 
-SCALE_STATUS: Final = "scale-enlarged pseudo-label, not metric"
-"""What the published labels are."""
-
-CONVENTIONS: Final = "camera: world-to-camera, OpenCV axes, metres; hands: camera frame"
 OURS: Final = "mint_episode"
 """Column of our own exports: JSON of what an Episode says beyond LeRobot's columns."""
 
-INTRINSICS_TOLERANCE: Final = 0.02
-"""How far ``intrinsics`` may be from those of ``fov``, in image sides, before a warning."""
-
-_ALIASES: Final = {"epickitchen": "epic", "epic-kitchens": "epic", "epic-kitchens-100": "epic"}
-_DOMAINS: Final = {"ego4d": "daily", "epic": "kitchen", "egodex": "tabletop"}
 _TOLD: Final = ("key", "image_size_hw", "text", "meta", "schema_version")
 _BULK: Final = ("stats/", "meta/episodes/")
 _LOG: Final = logging.getLogger(__name__)
@@ -71,7 +54,8 @@ def from_lerobot(
     view (vertical, horizontal), presence from ``hand_kept`` or ``{side}_kept``. Nothing is scaled
     or smoothed; an absent hand is ``hand_state.absent``. Times are those of the episode's video
     file: ``from_timestamp + k / fps``, from 0 where the root has no video. Keys are
-    ``<source>-<video uid>-<episode index>``, without the uid where the root does not state it.
+    ``<source>-<video uid>-<episode index>``, with ``Root.identity`` for a uid where the root does
+    not state it, so that two roots of one source have no key in common.
     ``meta["uid"]`` is the column ``video_uid``, ``uid`` or ``video_id`` of meta/episodes, else the
     root's own video file, else missing: see ``lerobot_origin``, also for what ``attach`` needs.
 
@@ -139,10 +123,7 @@ class RootReader:
         self, root: Root, source: str | None, scale_status: str, size: tuple[int, int] | None
     ) -> None:
         self.root = root
-        self.source = source or _source_of(root)
-        self.scale_status = scale_status
-        self.size = size
-        self.tasks = read_tasks(root)
+        self.meta = RootMeta(root, source, scale_status, size)
         self.episode_files = root.episode_files()
         self.rows: tuple[int, Any] | None = None
 
@@ -192,7 +173,7 @@ class RootReader:
         ours = _ours(row[OURS]) if row.get(OURS) else None
         there = ours["extra"] if ours else [c.name for c in EXTRA]
         optional = {c.name: got.get(c.name) if c.name in there else None for c in EXTRA}
-        told = ours or self._described(entry, row, path, dialect, got)
+        told = ours or self.meta.described(entry, row, path, dialect, got)
         length, times = int(entry["length"]), optional["timestamp_s"]
         return Episode.from_dict(
             {
@@ -230,82 +211,9 @@ class RootReader:
             row = known[1][row_number]
             if row.get(OURS):
                 told = _ours(row[OURS])
-                participant = told["meta"].get("participant")
-                yield str(told["meta"].get("uid") or told["key"]), participant
+                yield group_of(told["meta"], told["key"])
             else:
-                participant = attachment(row, self.root.info).get("participant")
-                yield video_uid(row) or self._key(None, number), participant
-
-    def _key(self, uid: str | None, number: int) -> str:
-        return "-".join(slug(part) for part in (self.source, uid, f"{number:06d}") if part)
-
-    def _described(
-        self,
-        entry: NDArray[Any],
-        row: Mapping[str, Any],
-        path: str,
-        dialect: Dialect,
-        got: Mapping[str, NDArray[Any]],
-    ) -> dict[str, Any]:
-        """Return what an episode of another project's root is called and where it is from."""
-        number = int(entry["episode_index"])
-        text, warnings = lerobot_text.segments(row, self.tasks, got.get("main_type"))
-        if dialect == "world":
-            warnings += _doubts(got, self._image_size())
-        warnings += origin_warnings(row)
-        video = {
-            n.rsplit("/", 1)[1]: v for n, v in row.items() if n.startswith(f"videos/{VIDEO_KEY}/")
-        }
-        known = {*(c.name for c in INDEX_COLUMNS), *ATTACHMENT} | {
-            "tasks",
-            "atomic_segments",
-            "dataset_to_index",
-        }
-        other = {n: v for n, v in row.items() if n not in known and not n.startswith("videos/")}
-        meta: dict[str, Any] = {
-            "source": self.source,
-            "uid": video_uid(row),
-            "domain": _DOMAINS.get(self.source),
-            "tasks": list(row.get("tasks") or ()),
-            "main_hand": lerobot_text.main_hand(got.get("main_type")),
-            "fps": self.root.fps,
-            **attachment(row, self.root.info),
-            "scale_status": self.scale_status,
-            "shape_space": "mano",
-            "conventions": CONVENTIONS,
-            "provenance": {
-                "format": f"LeRobot {self.root.info['codebase_version']}, {dialect} dialect",
-                "root": self.root.address,
-                "file": path,
-                "row": int(entry["dataset_from_index"] - entry["base"]),
-                "episode_index": number,
-                "video": video or None,
-                "columns": json.loads(json.dumps(other, default=str)),
-            },
-            "warnings": warnings,
-        }
-        return {
-            "key": self._key(stated_uid(row), number),
-            "image_size_hw": self._image_size(),
-            "text": [segment.to_dict() for segment in text],
-            "schema_version": SCHEMA_VERSION,
-            "start_s": float(video.get("from_timestamp") or 0.0),
-            "meta": {name: value for name, value in meta.items() if value is not None},
-        }
-
-    def _image_size(self) -> tuple[int, int]:
-        if self.size is not None:
-            return self.size
-        feature = self.root.info.get("features", {}).get(VIDEO_KEY, {})
-        shape, names = feature.get("shape") or (), feature.get("names") or ()
-        if len(shape) != 3:
-            raise LeRobotError(
-                f"{self.root.name(lerobot_files.INFO)}: features[{VIDEO_KEY!r}]['shape']: expected "
-                f"(height, width, 3), got {list(shape)}: pass image_size_hw"
-            )
-        first = [str(name)[:1] for name in names]
-        height, width = (first.index("h"), first.index("w")) if {"h", "w"} <= set(first) else (0, 1)
-        return int(shape[height]), int(shape[width])
+                yield group_of(self.meta.origin(row), self.meta.key(row, number))
 
 
 def files_of(index: NDArray[Any]) -> Iterator[slice]:
@@ -371,30 +279,3 @@ def _ours(text: str) -> dict[str, Any]:
     if missing:
         raise LeRobotError(f"{OURS}: expected the entries {names}, got none called {missing}")
     return cast("dict[str, Any]", told)
-
-
-def _doubts(got: Mapping[str, NDArray[Any]], image_size_hw: tuple[int, int]) -> list[str]:
-    """Warnings about an episode in the world dialect."""
-    doubts: list[str] = []
-    if "observation.state" not in got:
-        doubts.append("no hand shape in the source: zeros, the mean shape")
-    if "intrinsics" in got:
-        stated = got["intrinsics"].reshape(-1, 3, 3)
-        apart = np.abs(fov_vh_to_K(got["fov"][:, ::-1], image_size_hw) - stated).max()
-        if not apart <= INTRINSICS_TOLERANCE * max(image_size_hw):
-            doubts.append(
-                f"intrinsics differ by {apart:.1f} px from fov, which is used, and image size"
-            )
-    return doubts
-
-
-def slug(name: str) -> str:
-    """Return a name in characters that keys may have: others become '-'."""
-    return re.sub(r"[^a-z0-9_-]+", "-", name.lower()).strip("-") or "x"
-
-
-def _source_of(root: Root) -> str:
-    said = root.info.get("_source_dataset")
-    parts = [p for p in re.split(r"[/\\]+", root.folder) if not p.lower().startswith("lerobot")]
-    name = slug(str(said or (parts[-1] if parts else "lerobot")))
-    return _ALIASES.get(name, name)

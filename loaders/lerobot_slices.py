@@ -13,10 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mint_hub.loaders import lerobot_files
+from mint_hub.loaders.derived import SPLITS
+from mint_hub.loaders.lerobot_columns import LeRobotError
 from mint_hub.loaders.lerobot_files import open_root
 from mint_hub.loaders.lerobot_index import episode_index
 from mint_hub.loaders.lerobot_read import SCALE_STATUS, RootReader, data_file_of, files_of
 from mint_hub.loaders.schema import Episode
+from mint_hub.loaders.shards import split_of
 
 SLICE_FRAMES: Final = 16_384
 """A slice ends with the row group in which it reaches this many frames."""
@@ -46,7 +49,8 @@ class LeRobotSlices:
         storage_options: see ``from_lerobot``.
 
     Raises:
-        LeRobotError: while it is iterated or read, as ``from_lerobot`` says.
+        LeRobotError: while it is iterated or read, as ``from_lerobot`` says; or two of the roots
+            are the same.
 
     """
 
@@ -75,8 +79,14 @@ class LeRobotSlices:
         return {**self.__dict__, "_keep": None, "_reader": None}
 
     def __iter__(self) -> Iterator[LeRobotSlice]:
-        for number in range(len(self._roots)):
+        seen: dict[str, str] = {}
+        for number, address in enumerate(self._roots):
             reader = self._opened(number)
+            if (other := seen.setdefault(reader.root.identity, address)) is not address:
+                raise LeRobotError(
+                    f"roots: expected each once, got {other} and {address}, which are the same "
+                    "root or copies of it: leave one out"
+                )
             index = episode_index(reader.root)
             if self._keep is not None:
                 groups = reader.groups(index)
@@ -100,6 +110,27 @@ class LeRobotSlices:
             root = open_root(self._roots[number], self._storage_options)
             self._reader = number, RootReader(root, None, *self._options)
         return self._reader[1]
+
+
+def splits_of(
+    root: str | os.PathLike[str], storage_options: dict[str, Any] | None = None
+) -> list[str]:
+    """Return the splits that episodes of a root fall into by ``split_of``, in their usual order.
+
+    Reads meta/episodes, up to where every split is seen.
+
+    Raises:
+        LeRobotError: as ``from_lerobot`` says.
+
+    """
+    opened = open_root(root, storage_options)
+    reader, left = RootReader(opened, None, SCALE_STATUS, None), list(SPLITS)
+    for group in reader.groups(episode_index(opened)):
+        if (split := split_of(*group)) in left:
+            left.remove(split)
+        if not left:
+            break
+    return [split for split in SPLITS if split not in left]
 
 
 def _by_row_groups(reader: RootReader, episodes: NDArray[Any]) -> Iterator[NDArray[Any]]:

@@ -15,6 +15,7 @@ from typing import Any, Final
 from mint_hub.assets import asset_path
 from mint_hub.loaders.derived import SPLITS, VIDEO_MEMBER
 from mint_hub.loaders.lerobot_files import roots_below
+from mint_hub.loaders.lerobot_slices import splits_of
 from mint_hub.loaders.manifest import MANIFEST, Manifest, ShardRecord, unseal
 from mint_hub.loaders.tar_layout import CorpusError
 
@@ -88,7 +89,7 @@ def corpus_files(
     splits: dict[str, list[Shard]] = {}
     packed, stamp = False, hashlib.sha256(f"{place.identity} {config}".encode())
     for root in [r for part in parts for r in place.lerobot_roots(part)]:
-        for split in SPLITS:
+        for split in splits_of(root, {"token": token} if root.startswith("hf://") else None):
             splits.setdefault(split, []).append(Shard(root, split))
         folders = [f for f in folders if f"{place.prefix}{_parent(f)}" != root]
         if not place.fixed:

@@ -62,8 +62,10 @@ __all__ = [
     "decode_meta",
     "encode",
     "encode_all",
+    "hand_states",
     "member",
     "member_names",
+    "presence_of",
 ]
 
 MAX_COMPACT_ERROR_DEG: Final = 0.031
@@ -90,6 +92,8 @@ def encode(episode: Episode, format: Format = "compact", extra: bool = False) ->
 
     The same episode gives the same bytes. Rows depend on their own frame only, so the rows of a
     window are a window of the rows (but for ``extra.npy``, whose times count from the start).
+    Presence scores are in ``extra.npy`` alone: without it, in either format, an episode comes back
+    with none (``write_corpus`` counts such episodes and warns).
 
     Raises:
         EpisodeError: a compact episode whose shape varies, or times that are not start + k / fps
@@ -266,7 +270,7 @@ def _decode(values: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Episode:
         timestamps_s=times,
         T_camera_from_world=camera.T_camera_from_world(),
         fov_vh_rad=camera.fov_vh_rad.astype(np.float32),
-        hand_state=_state_of(values, arrays, code != ABSENT),
+        hand_state=hand_states(arrays, values["shape"], code != ABSENT),
         presence=code != ABSENT,
         presence_score=score,
         filled=code == FILLED if (code == FILLED).any() else None,
@@ -276,9 +280,30 @@ def _decode(values: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Episode:
     )
 
 
-def _state_of(
-    values: dict[str, Any], arrays: dict[str, NDArray[Any]], presence: NDArray[np.bool_]
+def presence_of(traj: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return which hands are there, (T, 2), by rows of ``traj.npy`` (T, 17).
+
+    Raises:
+        EpisodeError: a presence is none of ABSENT, OBSERVED and FILLED.
+
+    """
+    return _presence_code(traj) != ABSENT
+
+
+def hand_states(
+    arrays: Mapping[str, NDArray[Any]], shape: Any, presence: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
+    """Return hand states (T, 2, 109) by rows of the members of either format.
+
+    Args:
+        arrays: (T, C) by member name.
+        shape: of a compact sample's hands, (2, 10) or anything that broadcasts to (T, 2, 10).
+        presence: (T, 2).
+
+    Raises:
+        EpisodeError: lossless wrists that are not those of ``traj.npy``.
+
+    """
     traj = member(TRAJ).slices
     wrist = arrays[TRAJ][:, traj["left_wrist"].start : traj["right_wrist"].stop].reshape(-1, 2, 3)
     if STATE in arrays:
@@ -290,9 +315,10 @@ def _state_of(
         return state
     state = np.empty((len(wrist), 2, hands.HAND_STATE_SIZE), np.float32)
     state[..., hands.TRANSLATION] = wrist
-    state[..., ROTATIONS] = arrays[ROT6D].reshape(len(wrist), 2, -1)
-    shape = np.asarray(values["shape"], np.float32)
-    state[..., hands.SHAPE] = np.where(presence[..., None], shape, np.float32(0))
+    state[..., ROTATIONS] = arrays[ROT6D].reshape(-1, 2, ROTATIONS.stop - ROTATIONS.start)
+    state[..., hands.SHAPE] = np.where(
+        presence[..., None], np.asarray(shape, np.float32), np.float32(0)
+    )
     return state
 
 

@@ -27,7 +27,7 @@ from mint_hub.loaders.fields import (
     placed,
 )
 from mint_hub.loaders.member_table import META, Format
-from mint_hub.loaders.schema import SCHEMA_VERSION, Episode
+from mint_hub.loaders.schema import SCHEMA_VERSION, Episode, checked_version
 
 Kind = Literal["string", "integer", "number", "array", "object", "any"]
 
@@ -169,19 +169,13 @@ def _parsed(data: Any) -> dict[str, Any]:
 def _check_entries(values: Mapping[str, Any]) -> None:
     version = values.get("schema_version")
     _check_kind(_BY_NAME["schema_version"], version)
-    if cast("int", version) > SCHEMA_VERSION:
-        raise EpisodeError(
-            f"schema_version: expected at most {SCHEMA_VERSION}, got {version}: "
-            "written by a newer mint-hub, so upgrade this one"
-        )
+    checked_version(version)
     if missing := [name for name in _BY_NAME if name not in values]:
         raise EpisodeError(f"{missing[0]}: expected this entry, got none")
     if unknown := sorted(values.keys() - _BY_NAME.keys()):
         raise EpisodeError(f"{unknown[0]}: expected an entry of the schema, got an unknown name")
     for field in META_FIELDS:
         _check_kind(field, values[field.name])
-    if cast("int", version) < 1:
-        raise EpisodeError(f"schema_version: expected at least 1, got {version}")
     if values["format"] not in ("compact", "lossless"):
         raise EpisodeError(f"format: expected compact or lossless, got {values['format']!r}")
     for name in ("num_frames", "fps"):

@@ -40,6 +40,7 @@ __all__ = [
     "encode_clip",
     "pack",
     "pack_corpus",
+    "packed_images",
     "pixel_window",
     "read_window",
 ]
@@ -79,14 +80,7 @@ def read_window(
         ValueError: the frames are not all there.
 
     """
-    try:
-        with PackedClip(mp4) as clip:
-            if clip.num_frames != episode.num_frames:
-                got = clip.num_frames
-                raise VideoError(f"{MP4}: expected {episode.num_frames} frames, got {got}")
-            images = clip.images(start, length, size_hw)
-    except ValueError as error:
-        raise type(error)(f"{error} (episode {episode.key})") from None
+    images = _images(mp4, episode.num_frames, episode.key, start, length, size_hw)
     height, width = images.shape[1:3]
     window = episode.window(start, len(images))
     return PixelWindow(replace(window, image_size_hw=(height, width)), images)
@@ -110,6 +104,36 @@ def pixel_window(
     return read_window(reader[i], reader.member(i, MP4), start, length, size_hw)
 
 
+def packed_images(
+    reader: "CorpusReader",
+    i: int,
+    start: int = 0,
+    length: int | None = None,
+    size_hw: tuple[int, int] | None = None,
+) -> Images:
+    """Return the pictures of ``pixel_window`` alone, (length, H, W, 3) uint8 RGB; errors alike."""
+    mp4, num_frames = reader.member(i, MP4), int(reader.num_frames[i])
+    return _images(mp4, num_frames, reader.key(i), start, length, size_hw)
+
+
+def _images(
+    mp4: VideoSource,
+    num_frames: int,
+    key: str,
+    start: int,
+    length: int | None,
+    size_hw: tuple[int, int] | None,
+) -> Images:
+    """Pictures of the clip of an episode; errors name it."""
+    try:
+        with PackedClip(mp4) as clip:
+            if clip.num_frames != num_frames:
+                raise VideoError(f"{MP4}: expected {num_frames} frames, got {clip.num_frames}")
+            return clip.images(start, length, size_hw)
+    except ValueError as error:
+        raise type(error)(f"{error} (episode {key})") from None
+
+
 # ----------------------------------------------------------------------- pack
 
 
@@ -123,6 +147,8 @@ class Packer:
         videos: where the user's videos are: see `resolvers.resolve`.
         size_hw, gop, crf, preset: see `encode_clip`; the size is by default the episode's.
         options: what `VideoAttachment` takes beside.
+        lenses: the ``lens`` of each video by its uid, where ``options`` have none for all; a video
+            that is not named has that of its labels.
 
     """
 
@@ -132,10 +158,14 @@ class Packer:
     crf: int = CRF
     preset: str = PRESET
     options: dict[str, Any] | None = None
+    lenses: dict[str, Any] | None = None
 
     def __call__(self, episode: Episode) -> dict[str, bytes]:
         """Return ``{"mp4": bytes}``; errors as of `VideoAttachment`."""
-        video = VideoAttachment(episode, self.videos, **(self.options or {}))
+        options, uid = dict(self.options or {}), episode.meta.get("uid")
+        if self.lenses is not None and uid in self.lenses:
+            options["lens"] = self.lenses[uid]
+        video = VideoAttachment(episode, self.videos, **options)
         size = clip_size(self.size_hw, episode.image_size_hw)
         lengths = range(0, episode.num_frames, _CHUNK)
         chunks = (

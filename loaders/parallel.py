@@ -8,7 +8,7 @@ from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from mint_hub.loaders.tar_layout import CorpusError
 
@@ -19,12 +19,18 @@ _function: Callable[[Any], Any] | None = None
 
 
 def in_order(
-    function: Callable[[Any], T], items: Iterable[Any], num_procs: int = 1, batch: int = 16
+    function: Callable[[Any], T],
+    items: Iterable[Any],
+    num_procs: int = 1,
+    batch: int = 16,
+    start: Literal["spawn", "fork", "forkserver"] | None = None,
 ) -> Generator[T]:
     """Yield ``function(item)`` for every item, in their order, whatever the number of processes.
 
     Items are taken a few batches ahead of the reader, never all at once. ``function`` travels to
-    each process once. Processes end with the generator, and also when their parent is killed.
+    each process once. Processes end with the generator, and also when their parent is killed. They
+    start as Python has it by default, or as ``start`` says: what holds threads or graphics must
+    not be forked.
 
     Raises:
         CorpusError: a process died. What ``function`` raises is raised here.
@@ -36,7 +42,8 @@ def in_order(
     stream = iter(items)
     waiting: deque[Future[list[T]]] = deque()
     try:
-        with ProcessPoolExecutor(num_procs, initializer=_begin, initargs=(function,)) as pool:
+        context = multiprocessing.get_context(start)
+        with ProcessPoolExecutor(num_procs, context, _begin, (function,)) as pool:
             while part := list(islice(stream, batch)):
                 waiting.append(pool.submit(_do, part))
                 if len(waiting) > 2 * num_procs:

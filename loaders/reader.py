@@ -1,6 +1,6 @@
 """Random access to a corpus: episodes, windows and batches of windows from memory-mapped shards.
 
-    reader = CorpusReader("mint-ego", "ego4d", text="open the drawer", min_frames=64)
+    reader = CorpusReader("path/of/corpus", "ego4d", text="open the drawer", min_frames=64)
     episode = reader[0]                                    # a checked Episode
     rows = reader.arrays(0)["traj.npy"]                    # (T, 17), no copy
     batch = reader.random_windows(256, 16, rng)            # contiguous (256, 16, C) arrays
@@ -11,14 +11,15 @@ windows, L frames of a window, T frames of an episode, C columns of a member (``
 """
 
 import os
+import zlib
 from collections.abc import Iterable, Iterator, Sequence
-from functools import cached_property
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mint_hub.loaders.fields import require_window
+from mint_hub.loaders.episode_table import EpisodeTable
 from mint_hub.loaders.index import read_rows
 from mint_hub.loaders.manifest import EPISODES, INDEX, FileRecord
 from mint_hub.loaders.members import decode
@@ -28,6 +29,7 @@ from mint_hub.loaders.schema import Episode
 from mint_hub.loaders.selection import Selection
 from mint_hub.loaders.shard_maps import ShardMaps
 from mint_hub.loaders.tar_layout import CorpusError, key_at, members_at
+from mint_hub.loaders.window_draw import WindowDraw, checked_index, checked_windows
 
 if TYPE_CHECKING:
     from mint_hub.loaders.selection import Where
@@ -49,8 +51,12 @@ class CorpusReader(Sequence[Episode]):
         source: one source or several.
         min_frames: fewest frames.
         presence: least share of frames with the left and with the right hand.
-        verify: "size" compares the sizes of all shards in a folder when opening (remote ones are
-            compared by hash as they arrive); "full" compares every byte of all shards by hash.
+        verify: how much is compared with what was written. "size", when opening, the sizes of all
+            shards in a folder (remote ones by hash as they arrive): finds what is missing or cut.
+            Reading then looks at the headers and values of a sample, but a changed bit that leaves
+            them valid comes back as another number, unseen. "sample" also compares the crc32 of
+            each sample when it is first read, and raises where a bit of it changed. "full"
+            compares every byte of all shards by hash when opening, as `mint-hub verify --full`.
         on_error: "raise", or "skip": what cannot be read is left out of iteration, random windows
             and streams, counted in ``num_skipped`` and named in ``problems``.
         cache_dir: where remote files are kept.
@@ -73,18 +79,19 @@ class CorpusReader(Sequence[Episode]):
         source: str | Sequence[str] | None = None,
         min_frames: int | None = None,
         presence: float | tuple[float, float] | None = None,
-        verify: Literal["size", "full"] = "size",
+        verify: Literal["size", "sample", "full"] = "size",
         on_error: Literal["raise", "skip"] = "raise",
         cache_dir: str | os.PathLike[str] | None = None,
         storage_options: dict[str, Any] | None = None,
     ) -> None:
-        _check_option("verify", verify, ("size", "full"))
+        _check_option("verify", verify, ("size", "sample", "full"))
         _check_option("on_error", on_error, ("raise", "skip"))
         self._files = split_files(
             location, config, split, cache_dir=cache_dir, storage_options=storage_options
         )
         self.manifest = self._files.manifest()
         self.on_error = on_error
+        self._by_sample = verify == "sample"
         self.problems: list[str] = []
         self.num_skipped = 0
         self._records = {record.name: record for record in self.manifest.files}
@@ -96,7 +103,10 @@ class CorpusReader(Sequence[Episode]):
         lost = self._verify(full=verify == "full")
         self._select(rows, Selection(where, text, source, min_frames, presence), lost)
         self._state = np.zeros(len(self.num_frames), np.uint8)
-        self._ends: dict[int, NDArray[np.int64]] = {}
+        self._draws = WindowDraw(self.num_frames)
+        check = partial(self._files.check, self._records[EPISODES], full=True)
+        samples = [shard.samples for shard in self.manifest.shards]
+        self._table = EpisodeTable(partial(self._file, EPISODES), check, samples)
 
     # ------------------------------------------------------------- episodes
 
@@ -139,7 +149,7 @@ class CorpusReader(Sequence[Episode]):
 
     def key(self, i: int) -> str:
         """Return the key of an episode from the table, without opening its shard."""
-        return str(self._keys[int(self._row[i])])
+        return self._table.key(int(self._row[i]))
 
     def arrays(self, i: int) -> dict[str, NDArray[Any]]:
         """Return an episode's members as (T, C) read-only views of the shard, by name; no copy.
@@ -149,7 +159,7 @@ class CorpusReader(Sequence[Episode]):
             CorpusError: it cannot be read; names shard and episode.
 
         """
-        i = self._checked_index(i)
+        i = checked_index(i, len(self))
         if self._state[i] != _GOOD:
             self._touch(i)
         num_frames = int(self.num_frames[i])
@@ -187,11 +197,11 @@ class CorpusReader(Sequence[Episode]):
         """Return frames start .. start + length - 1 of ``arrays(i)``, still views.
 
         Raises:
-            ValueError: the frames are not all there, or length < 1.
+            ValueError: the frames are not all there, numbers that are not whole, or length < 1.
 
         """
-        i = self._checked_index(i)
-        self._check_windows(np.array([i]), np.array([start]), length)
+        i = checked_index(i, len(self))
+        checked_windows([i], [start], length, self.num_frames, self.key)
         return {name: rows[start : start + length] for name, rows in self.arrays(i).items()}
 
     def windows(
@@ -206,13 +216,11 @@ class CorpusReader(Sequence[Episode]):
             as_torch: tensors instead of arrays.
 
         Raises:
-            ValueError: the frames are not all there, or length < 1.
+            ValueError: the frames are not all there, numbers that are not whole, or length < 1.
             CorpusError: an episode cannot be read; names shard and episode.
 
         """
-        index, start = np.atleast_1d(np.asarray(indices)), np.atleast_1d(np.asarray(starts))
-        self._check_windows(index, start, length)
-        index, start = index.astype(np.int64), start.astype(np.int64)
+        index, start = checked_windows(indices, starts, length, self.num_frames, self.key)
         for i in np.unique(index[self._state[index] != _GOOD]).tolist():
             self._touch(i)
         batch = self._gather(index, start, length)
@@ -241,9 +249,9 @@ class CorpusReader(Sequence[Episode]):
 
         """
         rng = np.random.default_rng(rng)
-        index, start = self._draw(batch, length, rng)
+        index, start = self._draws.draw(batch, length, rng)
         while (bad := np.flatnonzero(~self._usable_mask(index))).size:
-            index[bad], start[bad] = self._draw(len(bad), length, rng)
+            index[bad], start[bad] = self._draws.draw(len(bad), length, rng)
         result = self._gather(index, start, length)
         return result.torch() if as_torch else result
 
@@ -283,8 +291,8 @@ class CorpusReader(Sequence[Episode]):
                     raise
                 failed.append(number)
                 self.problems.append(str(error))
-        if full:
-            self._files.check(self._records[EPISODES], full)
+        if full or self._by_sample:
+            self._files.check(self._records[EPISODES], full=True)
         return failed
 
     def _select(self, rows: NDArray[np.void], selection: Selection, lost: list[int]) -> None:
@@ -303,21 +311,10 @@ class CorpusReader(Sequence[Episode]):
         self.num_frames = mine["num_frames"].astype(np.int64)
         self._layout = row_layout(mine, self.manifest)
 
-    @cached_property
-    def _keys(self) -> Any:
-        from pyarrow import parquet
-
-        with parquet.ParquetFile(self._file(EPISODES)) as file:
-            return file.read(["key"])["key"]
-
-    @cached_property
-    def _first_rows(self) -> list[int]:
-        return np.cumsum([0, *(shard.samples for shard in self.manifest.shards)]).tolist()
-
     # -------------------------------------------------------------- reading
 
     def _members(self, i: int) -> dict[str, memoryview]:
-        i = self._checked_index(i)
+        i = checked_index(i, len(self))
         if self._state[i] != _GOOD:
             self._touch(i)
         shard, offset = int(self._shard[i]), int(self._offset[i])
@@ -329,9 +326,8 @@ class CorpusReader(Sequence[Episode]):
         """See, once an episode, that its rows are where the index says; CorpusError if not."""
         shard = int(self._shard[i])
         if self._maps.is_new(shard):
-            row = self._first_rows[shard]
             view, place = self._maps.view(shard), self._maps.name(shard)
-            expected, got = str(self._keys[row]), key_at(view, 0, place)
+            expected, got = self._table.first_key(shard), key_at(view, 0, place)
             if got != expected:
                 self._maps.drop(shard)
                 raise CorpusError(
@@ -344,6 +340,14 @@ class CorpusReader(Sequence[Episode]):
                     f"{rows.name}: expected ({num_frames}, {rows.width}) {rows.dtype.name} at byte "
                     f"{rows.at[i]}, got other bytes in {self._maps.name(shard)}, "
                     f"episode {self.key(i)}"
+                )
+        if self._by_sample:
+            start = int(self._offset[i])
+            got = zlib.crc32(view[start : start + int(self._size[i])])
+            if got != (expected := self._table.crc32(int(self._row[i]))):
+                raise CorpusError(
+                    f"{self._maps.name(shard)}, episode {self.key(i)}: expected bytes of crc32 "
+                    f"{expected:08x}, got {got:08x}: the file has changed since it was written"
                 )
         self._state[i] = _GOOD
 
@@ -368,47 +372,14 @@ class CorpusReader(Sequence[Episode]):
         if self.on_error == "raise":
             raise error
         self._state[i] = _LOST
-        self._ends.clear()
+        self._draws.leave_out(i)
         self.num_skipped += 1
         self.problems.append(str(error))
-
-    def _draw(
-        self, batch: int, length: int, rng: np.random.Generator
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        if length < 1:
-            raise ValueError(f"length: expected at least 1, got {length}")
-        if (ends := self._ends.get(length)) is None:
-            counts = np.maximum(self.num_frames - (length - 1), 0)
-            counts[self._state == _LOST] = 0
-            ends = self._ends[length] = np.cumsum(counts)
-        if not len(ends) or not ends[-1]:
-            raise ValueError(f"length: expected an episode of {length} frames, got none")
-        drawn = rng.integers(0, ends[-1], batch)
-        index = np.searchsorted(ends, drawn, side="right")
-        return index, drawn - ends[index] + self.num_frames[index] - (length - 1)
 
     def _gather(self, index: NDArray[np.int64], start: NDArray[np.int64], length: int) -> Windows:
         views = self._maps.views(self._shard[index])
         arrays = {rows.name: rows.gather(views, index, start, length) for rows in self._layout}
         return Windows(index, start, arrays)
-
-    def _checked_index(self, i: int) -> int:
-        if not -len(self) <= i < len(self):
-            raise IndexError(f"episode: expected 0 .. {len(self) - 1}, got {i}")
-        return i % len(self)
-
-    def _check_windows(self, index: NDArray[Any], start: NDArray[Any], length: int) -> None:
-        if index.shape != start.shape or index.ndim != 1:
-            raise ValueError(
-                f"starts: expected one for each of indices, got {start.shape} for {index.shape}"
-            )
-        if index.size and (index.min() < 0 or index.max() >= len(self)):
-            got = f"{index.min()} .. {index.max()}"
-            raise ValueError(f"indices: expected 0 .. {len(self) - 1}, got {got}")
-        bad = np.flatnonzero((start < 0) | (length < 1) | (start + length > self.num_frames[index]))
-        if bad.size:
-            i = int(index[bad[0]])
-            require_window(int(start[bad[0]]), length, int(self.num_frames[i]), self.key(i))
 
 
 def _check_option(name: str, value: str, known: tuple[str, ...]) -> None:

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mint_hub.loaders.fields import checked_size
+from mint_hub.loaders.lerobot_origin import file_in_root
+from mint_hub.loaders.participants import participant_of
 from mint_hub.loaders.schema import Episode
 from mint_hub.loaders.video_source import VideoError, VideoNotFoundError, VideoSource
 
@@ -29,6 +31,10 @@ GET_EPIC: Final = (
 GET_EGODEX: Final = (
     "take the archives part1 to part5, test and extra from EgoDex's page, "
     "https://github.com/apple/ml-egodex, and unpack them into ROOT"
+)
+GET_ROOT: Final = (
+    "take the videos of the LeRobot root that the labels are from: they name no other video than "
+    "that root's own file {uid!r}; ROOT is the folder of that root"
 )
 GET_OTHER: Final = "get it from whoever published {source!r}, or give another resolver"
 
@@ -134,7 +140,7 @@ class EpicVideos:
     def __call__(self, video: VideoReference) -> Path:
         """Return the file, or raise VideoNotFoundError that tells where it was looked for."""
         uid = _safe_uid(video)
-        person = uid.partition("_")[0]
+        person = participant_of("epic", uid) or uid.partition("_")[0]
         folders = (f"{person}/videos", f"EPIC-KITCHENS/{person}/videos", person, "")
         names = [f"{uid}{suffix}" for suffix in (".MP4", ".mp4")]
         places = [Path(self.root, folder, name) for folder in folders for name in names]
@@ -249,6 +255,7 @@ def _only(
         raise VideoError(f"{_named(video)}: expected one file, got {names}; make the uid say which")
     tried = "\n  ".join(map(str, places))
     person = participant or video.participant
+    hint = hint if file_in_root(video.uid) is None else GET_ROOT
     how = hint.format(uid=video.uid, source=video.source, participant=person)
     raise VideoNotFoundError(
         f"{_named(video)}: there is no such video; looked for\n  {tried}\nTo get it, {how}"
@@ -256,11 +263,14 @@ def _only(
 
 
 def _safe_uid(video: VideoReference) -> str:
-    """Return the uid; labels come from elsewhere and must not reach outside the user's folder."""
-    parts = video.uid.split("/")
-    if any(part in ("", ".", "..") or set(part) & set("\\:\0") for part in parts):
+    """Return which file the uid is, without its suffix.
+
+    Labels come from elsewhere and must not reach outside the user's folder.
+    """
+    uid = file_in_root(video.uid) or video.uid
+    if any(part in ("", ".", "..") or set(part) & set("\\:\0") for part in uid.split("/")):
         raise VideoError(f"{_named(video)}: expected a uid that names a file, got {video.uid!r}")
-    return video.uid
+    return uid
 
 
 def _plain(video: VideoReference, name: str, value: str) -> str:

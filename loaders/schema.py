@@ -57,6 +57,24 @@ SCHEMA_VERSION: Final = 1
 """Goes up when a reader of the previous version would misread what is written now."""
 
 
+def checked_version(value: object) -> int:
+    """Return a schema version that this code reads.
+
+    Raises:
+        EpisodeError: no whole number, below 1, or newer than SCHEMA_VERSION.
+
+    """
+    version = checks.integer(value, "schema_version")
+    if version > SCHEMA_VERSION:
+        raise EpisodeError(
+            f"schema_version: expected at most {SCHEMA_VERSION}, got {version}: "
+            "written by a newer mint-hub, so upgrade this one"
+        )
+    if version < 1:
+        raise EpisodeError(f"schema_version: expected at least 1, got {version}")
+    return version
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Episode:
     """A stretch of egocentric video with its camera and both hands.
@@ -258,12 +276,7 @@ class Episode:
 
         """
         given = dict(values)
-        version = given.pop("schema_version", SCHEMA_VERSION)
-        if checks.integer(version, "schema_version") > SCHEMA_VERSION:
-            raise EpisodeError(
-                f"schema_version: expected at most {SCHEMA_VERSION}, got {version}: "
-                "written by a newer mint-hub, so upgrade this one"
-            )
+        checked_version(given.pop("schema_version", SCHEMA_VERSION))
         known = {f.name for f in fields(cls)}
         optional = {"text", "meta", *(f.name for f in ARRAY_FIELDS if f.optional)}
         if missing := sorted(known - optional - given.keys()):
@@ -327,6 +340,8 @@ class Episode:
                 arrays[spec.name] = checks.checked_array(spec, value, num_frames)
         num_frames = len(arrays["timestamps_s"])
         checks.check_values(arrays)
+        if not isinstance(self.text, tuple | list):  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise EpisodeError(f"text: expected a tuple of TextSegments, got {self.text!r}")
         text = tuple(self.text)
         for segment in text:
             if not isinstance(segment, TextSegment):  # pyright: ignore[reportUnnecessaryIsInstance]

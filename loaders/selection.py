@@ -42,6 +42,9 @@ class Selection:
         presence: least share of frames, 0 to 1, in which the left and in which the right hand is
             there; one number holds for both hands.
 
+    Raises:
+        ValueError: a field is of another kind, or nothing can be as it says; names the field.
+
     """
 
     where: "Where | None" = None
@@ -49,6 +52,23 @@ class Selection:
     source: str | Sequence[str] | None = None
     min_frames: int | None = None
     presence: float | tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        _check_words("text", self.text, several=False)
+        _check_words("source", self.source, several=True)
+        conditions: Any = self.where
+        if isinstance(conditions, list | tuple):
+            for one in conditions:
+                triple = isinstance(one, list | tuple) and len(one) == 3
+                if not triple or not isinstance(one[0], str):
+                    raise ValueError(f"where: expected (column, op, value) each, got {one!r}")
+        frames: Any = self.min_frames
+        if frames is not None and (
+            isinstance(frames, bool) or not isinstance(frames, int | np.integer) or frames < 0
+        ):
+            raise ValueError(f"min_frames: expected a whole number of at least 0, got {frames!r}")
+        if self.presence is not None:
+            _least_shares(self.presence)
 
     def __bool__(self) -> bool:
         """Whether anything is asked for."""
@@ -65,12 +85,25 @@ class Selection:
         import pyarrow as pa
         from pyarrow import parquet
 
+        known: set[Any] = set()
+        chosen: list[NDArray[np.int64]] = []
         try:
             with parquet.ParquetFile(path) as file:
-                chosen = [self._chosen(table) for table in _tables(file, self._columns(), path)]
+                for table in _tables(file, self._columns(), path):
+                    chosen.append(self._chosen(table))
+                    if self.source is not None:
+                        known.update(table["source"].unique().to_pylist())
         except (pa.ArrowException, OSError) as error:
             raise CorpusError(f"{path}: cannot select episodes: {error}") from error
+        if unknown := [name for name in self._sources() if name not in known]:
+            there = sorted(name for name in known if name is not None)
+            raise ValueError(f"source: expected some of {there}, got {unknown[0]!r} ({path})")
         return np.concatenate([np.empty(0, np.int64), *chosen])
+
+    def _sources(self) -> list[str]:
+        if self.source is None:
+            return []
+        return [self.source] if isinstance(self.source, str) else list(self.source)
 
     def _columns(self) -> list[str] | None:
         """Columns to read; None: all, since an expression or a function may name any."""
@@ -78,7 +111,7 @@ class Selection:
         if self.where is not None:
             if not isinstance(self.where, list | tuple):
                 return None
-            names.update(name for name, _, _ in self.where)
+            names.update(condition[0] for condition in self.where)
         names.update(name for name in ("text", "source") if getattr(self, name) is not None)
         if self.presence is not None:
             names.update(_PRESENCE)
@@ -115,12 +148,35 @@ class Selection:
         if self.min_frames is not None:
             masks.append(pc.field("num_frames") >= self.min_frames)
         if self.source is not None:
-            sources = [self.source] if isinstance(self.source, str) else list(self.source)
-            masks.append(pc.field("source").isin(sources))
+            masks.append(pc.field("source").isin(self._sources()))
         if self.presence is not None:
-            least = np.broadcast_to(np.asarray(self.presence, np.float32), 2).tolist()
+            least = _least_shares(self.presence)
             masks += [pc.field(n) >= p for n, p in zip(_PRESENCE, least, strict=True)]
         return masks
+
+
+def _check_words(name: str, value: Any, several: bool) -> None:
+    """Refuse what is neither None nor text, nor ``several`` of it."""
+    many = several and isinstance(value, Sequence) and not isinstance(value, str | bytes)
+    words: list[Any] = list(value) if many else [] if value is None else [value]
+    if not all(isinstance(word, str) and word for word in words) or (many and not words):
+        expected = "text, or several texts" if several else "text"
+        raise ValueError(f"{name}: expected {expected}, got {value!r}")
+
+
+def _least_shares(presence: Any) -> list[float]:
+    """Return the least share of the left and of the right hand."""
+    pair = list(presence) if isinstance(presence, tuple | list | np.ndarray) else [presence] * 2
+    for share in pair:
+        number = isinstance(share, int | float | np.number) and not isinstance(share, bool)
+        if len(pair) != 2 or not number or not 0 <= share <= 1:
+            raise ValueError(
+                f"presence: expected a share of frames from 0 to 1, or one for the left and one "
+                f"for the right hand, got {presence!r}"
+            )
+    if len(pair) != 2:
+        raise ValueError(f"presence: expected one share, or one a hand, got {presence!r}")
+    return np.asarray(pair, np.float32).tolist()
 
 
 _PRESENCE: Final = tuple(f"presence_{side}" for side in SIDES)

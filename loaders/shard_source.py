@@ -56,11 +56,15 @@ Episodes = Made | Callable[[], Made]
 
 @dataclass(frozen=True)
 class EncodedSample:
-    """An episode as bytes of a shard: headers, members and padding."""
+    """An episode as bytes of a shard: headers, members and padding.
+
+    ``lost_scores`` says that the episode has presence scores for which its members have no place.
+    """
 
     key: str
     members: tuple[str, ...]
     data: bytes
+    lost_scores: bool = False
 
 
 def length_of(made: Made) -> int | None:
@@ -120,7 +124,9 @@ class _Encoder:
     def _packed(self, episode: Episode, members: dict[str, bytes]) -> EncodedSample:
         if self.extra_members is not None:
             members.update(self.extra_members(episode))
-        return EncodedSample(episode.key, tuple(members), pack_sample(episode.key, members))
+        data = pack_sample(episode.key, members)
+        lost = episode.presence_score is not None and not self.spec.extra
+        return EncodedSample(episode.key, tuple(members), data, lost)
 
 
 @dataclass(frozen=True)

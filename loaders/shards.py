@@ -12,6 +12,7 @@ Order within a split: episodes that can be indexed (``len`` and ``[i]``) are shu
 """
 
 import hashlib
+import logging
 import os
 import shutil
 from collections.abc import Iterator
@@ -69,12 +70,16 @@ __all__ = [
 
 VALIDATION: Final = 0.02
 
+_LOG = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class CorpusReport:
     """What ``write_corpus`` wrote.
 
     ``kept_shards`` were finished by an earlier call; ``content`` is the hash over all shards.
+    ``lost_scores`` episodes, of those that this call wrote, had presence scores that are not in the
+    shards, as these have no ``extra.npy``.
     """
 
     folder: Path
@@ -84,6 +89,7 @@ class CorpusReport:
     num_shards: int
     kept_shards: int
     content: str
+    lost_scores: int = 0
 
 
 def write_corpus(
@@ -110,7 +116,9 @@ def write_corpus(
         config: name of the config.
         split: name of the split.
         format: "compact" or "lossless".
-        extra: whether samples have ``extra.npy``, exact times and presence scores.
+        extra: whether samples have ``extra.npy``, exact times and presence scores. Without it, in
+            either format, episodes lose their scores: they are counted in the report and one
+            logged warning says so. Times that would be lost are refused.
         shard_bytes: size that no shard exceeds, unless one episode alone does.
         seed: of the shuffle; None keeps the order.
         num_procs: processes that encode; indexed episodes and slices are read in them as well.
@@ -123,8 +131,11 @@ def write_corpus(
             two episodes have one key; samples differ in their members; there are no episodes.
         EpisodeError: an episode cannot be encoded in this format.
         OSError: a file could not be written. What was finished is kept for the next call.
+        ValueError: ``num_procs`` is not at least 1.
 
     """
+    if type(num_procs) is not int or num_procs < 1:
+        raise ValueError(f"num_procs: expected a whole number of at least 1, got {num_procs!r}")
     spec = ShardSpec(config, split, format, extra, shard_bytes, seed, shuffle_buffer)
     final = Path(folder) / config / split
     work = UnfinishedSplit(final.with_name(f".{split}.partial"), spec)
@@ -139,8 +150,15 @@ def write_corpus(
     kept = work.resume(length)
     written = work.keys()
     with closing(encoded_samples(made, spec, extra_members, num_procs, written)) as samples:
-        _write_shards(work, samples, _bar(length, progress, len(written)))
-    return _report(final, _finish(work, final, num_procs), kept)
+        lost_scores = _write_shards(work, samples, _bar(length, progress, len(written)))
+    if lost_scores:
+        _LOG.warning(
+            "%s/%s: presence scores of %d episodes are not in the shards, which have no extra.npy: "
+            "write them with extra=True (--extra) to keep scores",
+            *(config, split, lost_scores),
+        )
+    report = _report(final, _finish(work, final, num_procs), kept)
+    return replace(report, lost_scores=lost_scores)
 
 
 def split_of(uid: str, participant: str | None = None, *, validation: float = VALIDATION) -> str:
@@ -160,18 +178,28 @@ def split_of(uid: str, participant: str | None = None, *, validation: float = VA
 # -------------------------------------------------------------- shards on disk
 
 
-def _write_shards(work: UnfinishedSplit, samples: Iterator[EncodedSample], bar: Any) -> None:
-    seen = set(work.keys())
-    sample = next(samples, None)
+def _write_shards(work: UnfinishedSplit, samples: Iterator[EncodedSample], bar: Any) -> int:
+    """Write all samples; return how many had presence scores that they do not hold."""
+    lost_scores = 0
+
+    def counted() -> Iterator[EncodedSample]:
+        nonlocal lost_scores
+        for sample in samples:
+            lost_scores += sample.lost_scores
+            yield sample
+
+    samples_left, seen = counted(), set(work.keys())
+    sample = next(samples_left, None)
     with bar:
         while sample is not None:
             partial = work.folder / f"shard.{os.getpid()}.partial"
             try:
                 with open(partial, "wb") as file:
-                    sample = _fill(work, file, sample, samples, seen, bar)
+                    sample = _fill(work, file, sample, samples_left, seen, bar)
             except BaseException:
                 partial.unlink(missing_ok=True)
                 raise
+    return lost_scores
 
 
 def _fill(
@@ -205,7 +233,10 @@ def _fill(
 
 def _check_sample(work: UnfinishedSplit, sample: EncodedSample, seen: set[str]) -> None:
     if sample.key in seen:
-        raise CorpusError(f"key: expected every episode to have its own, got {sample.key!r} twice")
+        raise CorpusError(
+            f"key: expected every episode to have its own, got {sample.key!r} twice: leave out the "
+            "input that comes a second time, or write the two to configs of their own"
+        )
     seen.add(sample.key)
     work.members = work.members or sample.members
     if sample.members != work.members:

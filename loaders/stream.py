@@ -6,7 +6,7 @@
         ...
         state = loader.state_dict()       # save it anywhere; load it with any ranks and workers
 
-The only module of the loaders that needs torch when it is imported.
+With ``action_dataset``, the only module of the loaders that needs torch when it is imported.
 """
 
 from collections.abc import Iterator, Mapping
@@ -21,21 +21,68 @@ from mint_hub.loaders.reader import CorpusReader, Windows
 from mint_hub.loaders.schema import Episode
 
 if TYPE_CHECKING:
-    Base = IterableDataset[Windows | list[Episode]]
+    Base = IterableDataset[Any]
 else:
     Base = IterableDataset
 
 
-class CorpusStream(Base):
+class ElasticStream(Base):
+    """Batches of samples 0 .. N - 1 in elastic order: what they hold is up to ``batch_of``.
+
+    Iterating goes on from the cursor, ``sampler``, and ends with the epoch. In a worker process of
+    a DataLoader the stream deals out its own part; ``ElasticLoader`` keeps count of such a loader.
+    Arguments and errors are those of ``ElasticSampler``; ``batch`` is its ``batch_size``.
+    """
+
+    def __init__(
+        self,
+        num_samples: int,
+        batch: int,
+        *,
+        seed: int | None = 0,
+        rank: int = 0,
+        world_size: int = 1,
+        drop_last: bool = False,
+    ) -> None:
+        super().__init__()
+        self.sampler = ElasticSampler(
+            num_samples, seed, rank, world_size, batch_size=batch, drop_last=drop_last
+        )
+        self._active = self.sampler
+
+    def batch_of(self, samples: NDArray[np.int64], epoch: int) -> Any:
+        """Return the batch of these samples, (batch,) numbers, in this epoch."""
+        raise NotImplementedError
+
+    def __iter__(self) -> Iterator[Any]:
+        """Yield the batches of this rank, or of this worker's part of it, to the epoch's end."""
+        info = get_worker_info()
+        if info is not None:
+            self._active = self.sampler.for_worker(info.id, info.num_workers)
+        active = self._active
+        for indices in active.batches():
+            yield self.batch_of(indices, active.epoch)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Go to the beginning of an epoch."""
+        self.sampler.set_epoch(epoch)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return where the run stands; in a worker, once all workers have come as far."""
+        return self._active.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go where a run stood; see ``ElasticSampler``."""
+        self.sampler.load_state_dict(state)
+
+
+class CorpusStream(ElasticStream):
     """Batches of a reader's episodes, each episode once an epoch over all ranks and workers.
 
     With ``length``, a batch is Windows: of every episode that is long enough one window, whose
     start follows from (seed, epoch, episode) alone. Without, it is a list of whole Episodes. What a
     batch holds never depends on the number of workers. With a reader that skips, a batch is shorter
     by the episodes that cannot be read.
-
-    Iterating goes on from the cursor, ``sampler``, and ends with the epoch. In a worker process of
-    a DataLoader the stream deals out its own part; ``ElasticLoader`` keeps count of such a loader.
 
     Args:
         reader: what to read.
@@ -58,48 +105,19 @@ class CorpusStream(Base):
         batch: int,
         length: int | None = None,
         *,
-        seed: int | None = 0,
-        rank: int = 0,
-        world_size: int = 1,
-        drop_last: bool = False,
         as_torch: bool = True,
+        **options: Any,
     ) -> None:
-        super().__init__()
         self.reader, self.length, self.as_torch = reader, length, as_torch
         self._samples = np.flatnonzero(reader.num_frames >= (length or 1))
         if length is not None and (length < 1 or not len(self._samples)):
             raise ValueError(f"length: expected an episode of {length} >= 1 frames, got none")
-        self.sampler = ElasticSampler(
-            len(self._samples),
-            seed,
-            rank,
-            world_size,
-            batch_size=batch,
-            drop_last=drop_last,
-        )
-        self._active = self.sampler
+        super().__init__(len(self._samples), batch, **options)
 
-    def __iter__(self) -> Iterator[Windows | list[Episode]]:
-        """Yield the batches of this rank, or of this worker's part of it, to the epoch's end."""
-        info = get_worker_info()
-        if info is not None:
-            self._active = self.sampler.for_worker(info.id, info.num_workers)
-        active = self._active
-        for indices in active.batches():
-            samples = self._samples[indices]
-            yield self._windows(samples, active.epoch) if self.length else self._episodes(samples)
-
-    def set_epoch(self, epoch: int) -> None:
-        """Go to the beginning of an epoch."""
-        self.sampler.set_epoch(epoch)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return where the run stands; in a worker, once all workers have come as far."""
-        return self._active.state_dict()
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go where a run stood; see ``ElasticSampler``."""
-        self.sampler.load_state_dict(state)
+    def batch_of(self, samples: NDArray[np.int64], epoch: int) -> Windows | list[Episode]:
+        """Return windows, or whole episodes, of these of the episodes that are long enough."""
+        episodes = self._samples[samples]
+        return self._windows(episodes, epoch) if self.length else self._episodes(episodes)
 
     def _windows(self, samples: NDArray[np.int64], epoch: int) -> Windows:
         assert self.length is not None
@@ -127,7 +145,7 @@ class ElasticLoader:
 
     """
 
-    def __init__(self, stream: CorpusStream, num_workers: int = 0, **options: Any) -> None:
+    def __init__(self, stream: ElasticStream, num_workers: int = 0, **options: Any) -> None:
         self.stream = stream
         self._loader: DataLoader[Any] = DataLoader(
             stream, batch_size=None, num_workers=num_workers, **options

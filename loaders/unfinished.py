@@ -81,7 +81,7 @@ class UnfinishedSplit:
         """Take over shards that are finished and whole, remove all else; return how many."""
         self.files.mkdir(parents=True, exist_ok=True)
         began = {**asdict(self.spec), "num_episodes": length}
-        if (self.folder / _SPEC).exists():
+        if (self.folder / _SPEC).exists() and any(self.files.glob(f"*{SUFFIX}")):
             was = read_sealed(self.folder / _SPEC)
             for name, value in began.items():
                 if was.get(name) != value:

@@ -8,7 +8,6 @@ frames. ``transl_camspace`` is MANO's transl, which lies about 0.10 m from the w
 ``transl_worldspace`` is the wrist itself. The wrist is therefore taken from the joints.
 """
 
-import re
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
@@ -23,6 +22,8 @@ from mint_hub.geometry import rigid
 from mint_hub.geometry.camera import K_to_fov_vh
 from mint_hub.geometry.plain_pickle import load_plain_npy
 from mint_hub.geometry.rotations import nearest_rotation
+from mint_hub.loaders.fields import slug
+from mint_hub.loaders.participants import participant_of
 from mint_hub.loaders.schema import Episode, TextSegment
 
 Float = NDArray[np.float64]
@@ -69,14 +70,16 @@ def from_vitra(
 
     """
     path = Path(path)
-    content = load_plain_npy(path)
-    if not isinstance(content, dict):
-        raise ValueError(f"{path}: expected a dict of fields, got {type(content).__name__}")
-    fields = cast("dict[str, Any]", content)
     try:
+        content = load_plain_npy(path)
+        if not isinstance(content, dict):
+            raise ValueError(f"expected a dict of fields, got {type(content).__name__}")
+        fields = cast("dict[str, Any]", content)
         return _episode(fields, path, key, source, fps, start_s, image_size_hw)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        # What is wrong within a pickle is told without the file, all else with it.
+        told = str(error).removeprefix(f"{path}: ")
+        raise type(error)(f"{path}: {told}") from None
 
 
 def _episode(
@@ -100,9 +103,11 @@ def _episode(
     warnings = [
         f"text of the {side} hand without frames left out: {words}" for side, words in empty
     ]
-    name = path.stem
+    name, uid = path.stem, str(_field(fields, "video_name"))
+    source = source or name.split("_")[0].lower()
+    participant = participant_of(source, uid)
     return Episode(
-        key=key or re.sub(r"[^a-z0-9_-]", "-", name.lower()),
+        key=key or slug(name),
         timestamps_s=start + (frames - frames[0]) / fps,
         T_camera_from_world=T_camera_from_world,
         fov_vh_rad=np.tile(K_to_fov_vh(K, size), (num_frames, 1)).astype(np.float32),
@@ -111,8 +116,9 @@ def _episode(
         image_size_hw=size,
         text=text,
         meta={
-            "source": source or name.split("_")[0].lower(),
-            "uid": str(_field(fields, "video_name")),
+            "source": source,
+            "uid": uid,
+            **({} if participant is None else {"participant": participant}),
             "fps": fps,
             "native_fps": float(fps),
             "video_start_sec": float(start - frames[0] / fps),

@@ -19,6 +19,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mint_hub.loaders.beside import Beside, labels_beside
 from mint_hub.loaders.card import write_card
 from mint_hub.loaders.changelog import Changelog, Tombstone, checked_date
 from mint_hub.loaders.index import Index
@@ -41,10 +42,18 @@ _SUFFIX: Final = ".withdrawing"
 
 @dataclass(frozen=True)
 class WithdrawReport:
-    """What ``withdraw`` took out: episodes by "config/split", and the splits that held no more."""
+    """What ``withdraw`` took out.
+
+    Attributes:
+        episodes: how many, by "config/split".
+        removed_splits: the splits that held no more.
+        beside: files and folders beside the shards, relative to the corpus (see ``beside``).
+
+    """
 
     episodes: Mapping[str, int]
     removed_splits: tuple[str, ...]
+    beside: tuple[str, ...] = ()
 
 
 def withdraw(
@@ -59,9 +68,10 @@ def withdraw(
     """Take all episodes of some videos out of every config of a corpus; leave tombstones.
 
     Tombstones go to ``changelog.json`` and the card; the ``spec`` of a split made anew lists the
-    uids under "withdrawn". A split that would be empty is removed. Calling again with the same
-    videos changes nothing. Copies elsewhere, packed clips in other folders included, are not known
-    here.
+    uids under "withdrawn". A split that would be empty is removed. Labels of the videos beside the
+    shards go as well (``beside``); the accounts of `mint-hub label`, which hold no labels, stay.
+    Calling again with the same videos changes nothing. Copies elsewhere, packed clips in other
+    folders included, are not known here.
 
     Args:
         folder: the corpus, with ``<config>/<split>`` below it.
@@ -73,7 +83,8 @@ def withdraw(
 
     Raises:
         CorpusError: no such video, or of several sources; nothing would remain; a split is
-            unfinished or damaged. Nothing is changed then.
+            unfinished or damaged, or nobody can say whose a file beside the shards is. Nothing is
+            changed then.
 
     """
     root, names = Path(folder), _checked(uids)
@@ -81,18 +92,21 @@ def withdraw(
     _recover(root)
     splits = [_Split.load(path, names, source) for path in _splits(root)]
     changelog = Changelog.load(root)
-    _check(root, splits, names, source, changelog)
+    beside = [b for b in labels_beside(root) if b.uid in names and source in (None, b.source)]
+    _check(root, splits, beside, names, source, changelog)
     hit = [split for split in splits if split.hits.any()]
     for split in hit:
         split.check_shards()
-    if hit:
-        _bury(root, changelog, hit, reason, day)
+    _bury(root, changelog, hit, beside, reason, day)
+    for labels in beside:
+        shutil.rmtree(labels.path) if labels.path.is_dir() else labels.path.unlink()
     removed = [split for split in hit if split.hits.all()]
     for split in hit:
         split.remove() if split in removed else split.rewrite(num_procs)
     write_card(root)
     taken = {split.name: int(split.hits.sum()) for split in hit}
-    return WithdrawReport(taken, tuple(split.name for split in removed))
+    files = tuple(a.path.relative_to(root).as_posix() for a in beside)
+    return WithdrawReport(taken, tuple(split.name for split in removed), files)
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,11 +217,12 @@ def _splits(root: Path) -> list[Path]:
 def _check(
     root: Path,
     splits: list[_Split],
+    beside: list[Beside],
     uids: frozenset[str],
     source: str | None,
     changelog: Changelog,
 ) -> None:
-    videos = {video for split in splits for video in split.videos}
+    videos = _videos(splits, beside)
     sources = {uid: sorted(s for s, u in videos if u == uid) for uid in sorted(uids)}
     for uid, of in sources.items():
         if len(of) > 1:
@@ -219,16 +234,29 @@ def _check(
         raise CorpusError(f"{root}: expected an episode to remain, got none: delete the folder")
 
 
-def _bury(root: Path, log: Changelog, hit: list[_Split], reason: str, day: str) -> None:
+def _videos(splits: list[_Split], beside: list[Beside]) -> set[tuple[str, str]]:
+    """Return the (source, uid) of all that goes."""
+    return {v for split in splits for v in split.videos} | {(b.source, b.uid) for b in beside}
+
+
+def _bury(
+    root: Path,
+    log: Changelog,
+    hit: list[_Split],
+    beside: list[Beside],
+    reason: str,
+    day: str,
+) -> None:
     """Write tombstones; one that a killed call has written already stays as it is."""
     stones = list(log.withdrawn)
-    for source, uid in sorted({video for split in hit for video in split.videos}):
+    for source, uid in sorted(_videos(hit, beside)):
         if log.has(uid, source):
             continue
         counts = {split.name: split.videos.count((source, uid)) for split in hit}
         found = {name: count for name, count in counts.items() if count}
         stones.append(Tombstone(source, uid, day, reason, found))
-    replace(log, withdrawn=tuple(stones)).save(root)
+    if len(stones) > len(log.withdrawn):
+        replace(log, withdrawn=tuple(stones)).save(root)
 
 
 # ------------------------------------------------------------------------ one after the other

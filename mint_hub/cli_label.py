@@ -70,6 +70,7 @@ def _label(args: argparse.Namespace) -> int:
         raise ValueError("-o, --out: expected the folder of the corpus to write")
     from mint_hub.inference.batch import find_videos
     from mint_hub.labelling.build import build_cascade
+    from mint_hub.labelling.doctor import check_ready
     from mint_hub.labelling.label import FOLDER, label_videos
     from mint_hub.labelling.runner import InProcess
 
@@ -80,6 +81,7 @@ def _label(args: argparse.Namespace) -> int:
 
         executor = OnRay(cascade, args.ray)
     else:
+        check_ready(cascade.stages)
         executor = InProcess(cascade)
     report = label_videos(
         find_videos(args.videos),
@@ -101,9 +103,11 @@ def _label(args: argparse.Namespace) -> int:
 
 
 def _doctor(chosen: dict[str, str], settings: dict[str, dict[str, Any]]) -> int:
-    from mint_hub.labelling.backends import default_backend
+    from mint_hub.labelling.backends import backend_of, default_backend
     from mint_hub.labelling.doctor import doctor
 
+    for stage, name in chosen.items():
+        backend_of(stage, name)
     named = {
         f"{stage}={chosen.get(stage) or default_backend(stage)}": s for stage, s in settings.items()
     }
@@ -135,15 +139,33 @@ def _choices(args: argparse.Namespace) -> tuple[dict[str, str], dict[str, dict[s
     if args.scale:
         settings.setdefault("scale", {})["known"] = args.scale
     if args.lens:
-        path = Path(args.lens)
-        text = path.read_text() if path.suffix == ".json" else args.lens
-        try:
-            settings.setdefault("undistort", {})["lens"] = json.loads(text)
-        except json.JSONDecodeError as error:
-            raise ValueError(f"--lens: expected JSON or a .json file, got {error}") from None
+        lens = _lens(args.lens)
+        settings.setdefault("undistort", {})["lens"] = lens
+        if chosen.setdefault("intrinsics", "given") == "given":
+            settings.setdefault("intrinsics", {})["lens"] = lens
     if args.annotations:
+        if not args.annotations.exists():
+            raise ValueError(f"--annotations: expected a file, found none at {args.annotations}")
         settings.setdefault("describe", {})["path"] = str(args.annotations)
     return chosen, settings
+
+
+def _lens(given: str) -> dict[str, Any]:
+    """Read a lens as JSON, and try it before any video is."""
+    from mint_hub.geometry.lenses import lens_from
+
+    path = Path(given)
+    try:
+        lens = json.loads(path.read_text() if path.suffix == ".json" else given)
+        lens = lens if isinstance(lens, dict) else {"K": lens}
+        lens_from(lens, lens.get("image_size_hw", (1000, 1000)))
+    except OSError as error:
+        raise ValueError(f"--lens: {path}: {error.strerror}") from None
+    except json.JSONDecodeError as error:
+        raise ValueError(f"--lens: expected JSON or a .json file, got {error}") from None
+    except ValueError as error:
+        raise ValueError(f"--lens: {error}") from None
+    return lens
 
 
 def _json_or_text(value: str) -> Any:

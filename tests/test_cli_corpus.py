@@ -21,6 +21,7 @@ from mint_hub.loaders.reader import CorpusReader
 from mint_hub.loaders.shards import split_of
 from tests.corpus_faults import tree
 from tests.episodes import make_episode
+from tests.loaders.test_vitra import annotation
 
 
 @pytest.fixture
@@ -63,6 +64,48 @@ def test_withdrawn_videos_go_and_stay_away(root, tmp_path, capsys):
         assert len(left) == 5
         assert gone not in left
     assert "asked for by its owner" in (corpus / "README.md").read_text()
+
+
+def test_one_bad_file_among_good_ones(tmp_path, capsys):
+    """Raised by default, or left out, counted and named."""
+    paths = [tmp_path / f"ego4d_{name}_ep_1.npy" for name in ("a", "b", "c")]
+    for path in paths:
+        fields = {**annotation(), "video_name": path.stem}
+        np.save(path, np.array(fields, dtype=object), allow_pickle=True)
+    paths[1].write_bytes(paths[1].read_bytes()[:500])
+    corpus = tmp_path / "corpus"
+    call = ["convert", "vitra", *map(str, paths), "-o", str(corpus), "--config", "made", "--quiet"]
+    assert main(call) == 2
+    assert f"{paths[1]}: " in capsys.readouterr().err
+    assert not (corpus / "made/train/shards.json").exists()
+    shutil.rmtree(corpus, ignore_errors=True)
+    skipping = [*call, "--on-error", "skip"]
+    assert main(skipping) == 1
+    said = capsys.readouterr().out
+    assert f"skipped 1 of 3 sources:\n{paths[1]}: " in said
+    assert said.count(str(paths[1])) == 1
+    found = [
+        episode.meta["uid"]
+        for split in ("train", "validation")
+        if (corpus / "made" / split).exists()
+        for episode in CorpusReader(corpus, "made", split)
+    ]
+    assert sorted(found) == [paths[0].stem, paths[2].stem]
+    shutil.rmtree(corpus)
+    for path in paths:
+        path.write_bytes(b"")
+    assert main(skipping) == 2
+    assert "skipped 3 of 3 sources" in capsys.readouterr().out
+
+
+def test_scores_that_are_left_out_are_told(root, tmp_path, caplog):
+    call = ["convert", "lerobot", str(root), "--config", "made", "--split", "train", "--quiet"]
+    assert main([*call, "-o", str(tmp_path / "with"), "--extra"]) == 0
+    assert not caplog.records
+    assert main([*call, "-o", str(tmp_path / "without")]) == 0
+    (line,) = caplog.messages
+    assert "made/train: presence scores of 6 episodes are not in the shards" in line
+    assert "--extra" in line
 
 
 # ------------------------------------------------------------------ going on
@@ -150,7 +193,7 @@ def test_an_unfinished_split_of_other_inputs_is_refused(both, tmp_path, capsys):
     corpus = tmp_path / "corpus"
     for number in range(100):
         die_at_rename(call_of(other, corpus), number)
-        if (corpus / "made/.train.partial/files").exists():
+        if list(corpus.glob("made/.train.partial/files/*.tar")):
             break
         shutil.rmtree(corpus, ignore_errors=True)
     info = other / "meta/info.json"

@@ -7,7 +7,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from importlib import import_module
-from typing import Any, Final, get_args, get_type_hints
+from types import UnionType
+from typing import Any, Final, Literal, Union, get_args, get_origin, get_type_hints
 
 from mint_hub.labelling.stage import Stage
 
@@ -181,7 +182,8 @@ def make(stage: str, name: str | None, settings: Mapping[str, Any] | None = None
         settings: by name; lists become tuples, mappings become settings within settings.
 
     Raises:
-        ValueError: no such backend, a setting it does not have, or a value it refuses.
+        ValueError: no such backend, a setting it does not have, a value of another kind, or one
+            that it refuses.
 
     """
     backend = backend_of(stage, name or default_backend(stage) or _only_one(stage))
@@ -207,4 +209,27 @@ def _settings(kind: type[Any], given: Mapping[str, Any], where: str) -> Any:
         if inner and isinstance(value, Mapping):
             value = _settings(inner[0], value, f"{where}.{name}")  # pyright: ignore
         values[name] = tuple(value) if isinstance(value, list) else value  # pyright: ignore
+        if not _fits(values[name], hints[name]):
+            hint = hints[name]
+            expected = hint.__name__ if isinstance(hint, type) else str(hint)
+            raise ValueError(f"{where}, {name}: expected {expected}, got {value!r}")
     return kind(**values)
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a plain value is what a type hint of settings says."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        return any(_fits(value, one) for one in inner)
+    if origin is Literal:
+        return value in inner
+    if origin is tuple and isinstance(value, tuple):
+        parts: tuple[Any, ...] = value  # pyright: ignore[reportUnknownVariableType]
+        if inner[-1] is Ellipsis:
+            return all(_fits(part, inner[0]) for part in parts)
+        return len(parts) == len(inner) and all(map(_fits, parts, inner))
+    if hint in (int, float) and isinstance(value, bool):
+        return False
+    if hint is float:
+        return isinstance(value, int | float)
+    return hint is Any or isinstance(value, origin or hint)

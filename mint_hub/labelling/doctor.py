@@ -7,7 +7,8 @@ from typing import Any
 
 from mint_hub.labelling.backends import BACKENDS, Backend, make
 from mint_hub.labelling.environments import Environment
-from mint_hub.labelling.readiness import Lack, python_lacks
+from mint_hub.labelling.readiness import Lack, check, python_lacks
+from mint_hub.labelling.stage import Stage
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,17 @@ def doctor(
     return [_examine(b, settings.get(f"{b.stage}={b.name}")) for b in chosen]
 
 
+def check_ready(stages: Iterable[Stage]) -> None:
+    """Look at stages before hours go into the first ones.
+
+    Raises:
+        NotReadyError: names all that is missing and does not come by itself.
+
+    """
+    found = [_lacks_of(stage) for stage in stages]
+    check([lack for lacks, automatic in found if not automatic for lack in lacks])
+
+
 def _examine(backend: Backend, settings: Mapping[str, Any] | None) -> Readiness:
     try:
         lacks, automatic = _lacks(backend, settings)
@@ -96,11 +108,15 @@ def _lacks(backend: Backend, settings: Mapping[str, Any] | None) -> tuple[tuple[
     """What is missing, and whether only an environment is that comes by itself."""
     backend.load()
     try:
-        stage: Any = make(backend.stage, backend.name, settings)
+        stage = make(backend.stage, backend.name, settings)
     except ValueError as error:
         if settings is not None:
             raise
         return (Lack(f"settings: {error}", "give them with the backend"),), False
+    return _lacks_of(stage)
+
+
+def _lacks_of(stage: Any) -> tuple[tuple[Lack, ...], bool]:
     python = str(getattr(stage.settings, "python", None) or "")
     environment = getattr(stage, "environment", None) or getattr(
         sys.modules[type(stage).__module__], "ENVIRONMENT", None

@@ -21,15 +21,17 @@ from mint_hub.labelling.records import Lost, Video
 from mint_hub.labelling.runner import Executor, InProcess, Run
 from mint_hub.labelling.stage import lost_seconds
 from mint_hub.loaders.atomic import replacing
+from mint_hub.loaders.beside import ACCOUNT, LABELLING
 from mint_hub.loaders.card import write_card
 from mint_hub.loaders.changelog import Changelog
 from mint_hub.loaders.integrity import verify
+from mint_hub.loaders.participants import group_of
 from mint_hub.loaders.schema import Episode
 from mint_hub.loaders.shards import CorpusReport, split_of, write_corpus
+from mint_hub.loaders.unfinished import ShardSpec
 from mint_hub.loaders.video import VideoError, probe
 
-FOLDER: Final = "labelling"
-ACCOUNT: Final = "account.json"
+FOLDER: Final = LABELLING
 ROUNDING_S: Final = 0.1
 """Container durations and frame times differ by this much without anything being lost."""
 
@@ -128,8 +130,10 @@ def label_videos(
 
     Raises:
         FullDiskError, NotReadyError: nothing can go on; the same call goes on later.
+        CorpusError: the source is no name of a config.
 
     """
+    ShardSpec(source, "train")
     say = say or (lambda _line: None)
     report = LabelReport(out)
     books = _Books(out / FOLDER, cascade, keep_work)
@@ -272,7 +276,8 @@ class _Books:
             account = json.loads(path.read_text())
             if account["source"] == source and not withdrawn.has(account["uid"], source):
                 names = [path.parent / "episodes" / f"{key}.npz" for key in account["episodes"]]
-                files.setdefault(split_of(account["uid"]), []).extend(names)
+                group = group_of(account, key=account["uid"])
+                files.setdefault(split_of(*group), []).extend(names)
         return files
 
     def _fingerprint(self, video: Video) -> str:

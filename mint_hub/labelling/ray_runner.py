@@ -1,8 +1,9 @@
 """The cascade on Ray: stages as actors, on this machine or a cluster.
 
-An actor holds one stage and does its tasks; it writes their files itself, so the work folder has to
-be one that all machines see. The driver makes actors as tasks need them, never more than the
-cluster's resources hold, and ends idle ones to make room for another stage's.
+An actor does the tasks of one stage; it writes their files itself, so the work folder has to be one
+that all machines see. The driver makes actors as tasks need them, never more than the cluster's
+resources hold. Where there is no room, an idle actor that occupies as much goes over to the stage
+(not on a GPU, whose memory it would keep), or idle ones are ended.
 """
 
 from collections.abc import Sequence
@@ -25,7 +26,7 @@ def import_ray() -> Any:
         import ray
     except ImportError:
         raise ImportError(
-            'labelling on Ray needs the package ray: pip install "mint-hub[ray]"'
+            'labelling on Ray needs the package ray: pip install "mint-hub[labelling]"'
         ) from None
     return ray
 
@@ -93,7 +94,7 @@ class OnRay:
         worker = next(
             (w for w in self._workers if w.position == task.position and w.busy is None), None
         )
-        worker = worker or self._started(task.position)
+        worker = worker or self._gone_over(task.position) or self._started(task.position)
         worker.task = task
         worker.busy = worker.actor.perform.remote(task)
 
@@ -127,6 +128,22 @@ class OnRay:
         except self._ray.exceptions.RayError as error:
             self._end(worker)
             return task, Died(str(error).strip().splitlines()[0])
+
+    def _gone_over(self, position: int) -> _Worker | None:
+        """Return an idle actor of another stage for this one, where there is no room for its own.
+
+        To start one takes seconds, which short tasks on a full machine would pay every time.
+        """
+        wanted = self._cascade.stages[position].resources
+        if wanted.gpus or wanted.cpus <= self._free["cpus"] + 1e-9:
+            return None
+        for worker in self._workers:
+            has = worker.resources
+            enough = has.cpus == wanted.cpus and has.memory_gib >= wanted.memory_gib
+            if worker.busy is None and not has.gpus and enough:
+                worker.position = position
+                return worker
+        return None
 
     def _started(self, position: int) -> _Worker:
         wanted = self._cascade.stages[position].resources

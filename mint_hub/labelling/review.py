@@ -4,7 +4,8 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from mint_hub.labelling.label import ACCOUNT, FOLDER
+from mint_hub.labelling.label import FOLDER
+from mint_hub.loaders.beside import ACCOUNT
 from mint_hub.loaders.schema import Episode
 from mint_hub.view.overlay import write_overlay
 from mint_hub.view.plots import write_trajectory_plot
@@ -26,9 +27,10 @@ def write_reviews(corpus: Path) -> Iterator[Path]:
         for key in said["episodes"]:
             target = corpus / FOLDER / "review" / key
             page = target / "episode.html"
-            if page.exists():
+            path = account.parent / "episodes" / f"{key}.npz"
+            if page.exists() or not path.exists():  # made before, or withdrawn
                 continue
-            episode = Episode.load(account.parent / "episodes" / f"{key}.npz")
+            episode = Episode.load(path)
             target.mkdir(parents=True, exist_ok=True)
             overlay = write_overlay(episode, said["file"], target / "episode.mp4")
             write_trajectory_plot(episode, target / "episode.png")

@@ -278,6 +278,24 @@ def test_ray_retries_a_dead_worker_and_isolates_a_poison_clip(tmp_path, videos, 
     assert sum(report.hours_lost.values()) == pytest.approx(2 / 3600)
 
 
+def test_ray_actors_go_over_to_another_stage_where_there_is_no_room(
+    tmp_path, videos, on_ray, monkeypatch
+):
+    started = []
+    start = on_ray._started
+
+    def remembered(self, position):
+        started.append(position)
+        return start(self, position)
+
+    monkeypatch.setattr(on_ray, "_started", remembered)
+    stages = cascade(tmp_path)
+    executor = on_ray(stages, num_cpus=1)
+    label_videos(videos, tmp_path / "out", stages, executor=executor)
+    assert keys(tmp_path / "out") == ALL
+    assert started == [0]
+
+
 def test_ray_refuses_what_the_cluster_cannot_hold(tmp_path, on_ray):
     from mint_hub.labelling.stage import Resources
 

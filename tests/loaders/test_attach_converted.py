@@ -13,8 +13,9 @@ from mint_hub.loaders.attach import VideoAttachment, VideoMismatchError
 from mint_hub.loaders.device_trajectories import DeviceTrajectory, episode_from_trajectory
 from mint_hub.loaders.hot3d import from_hot3d
 from mint_hub.loaders.lerobot import from_lerobot
+from mint_hub.loaders.lerobot_files import open_root
 from mint_hub.loaders.reader import CorpusReader
-from mint_hub.loaders.resolvers import VideoReference
+from mint_hub.loaders.resolvers import Ego4DVideos, VideoReference
 from mint_hub.loaders.video import VideoNotFoundError, iter_frames
 from tests import video_files as make
 from tests.episodes import make_episode
@@ -81,7 +82,8 @@ def test_a_root_with_its_own_videos_is_its_own_resolver(tmp_path):
     for number in range(2):
         make.video(folder / f"file-{number:03d}.mp4", 100 + number)
     for k, episode in enumerate(sorted(convert("lerobot", root, tmp_path / "c"), key=_key)):
-        assert episode.meta["uid"] == f"videos/observation.images.ego/chunk-000/file-{k:03d}"
+        file = f"videos/observation.images.ego/chunk-000/file-{k:03d}"
+        assert episode.meta["uid"] == f"lerobot-{open_root(root).identity}/{file}"
         assert "may join several videos" in episode.meta["warnings"][-1]
         video = VideoAttachment(episode, root)
         assert video.info.num_frames == 100 + k
@@ -129,6 +131,15 @@ def test_a_root_may_tell_what_attaching_needs(tmp_path):
         make.video(path, 60, rate=Fraction(columns_of))
         with pytest.raises(VideoMismatchError, match=refused):
             VideoAttachment(later, tmp_path, lens=None)
+
+
+def test_labels_that_name_no_video_say_which_folder_has_it(tmp_path):
+    write_root(tmp_path / "root", RootPlan(lengths=(12,), source="ego4d"))
+    (episode,) = from_lerobot(tmp_path / "root")
+    for videos in (tmp_path, Ego4DVideos(tmp_path)):
+        with pytest.raises(VideoNotFoundError, match="take the videos of the LeRobot root") as told:
+            VideoAttachment(episode, videos)
+        assert "ego4d --output_directory" not in str(told.value)
 
 
 def test_a_root_that_names_no_video_gives_no_uid(tmp_path):

@@ -257,19 +257,26 @@ def test_egodex_through_a_stand_in_for_h5py(tmp_path, monkeypatch):
 
 
 def test_egodex_with_h5py_itself(tmp_path):
-    h5py = pytest.importorskip("h5py", reason="h5py is optional: only EgoDex files need it")
+    h5py = pytest.importorskip(
+        "h5py", reason="h5py comes with the extra test: only EgoDex files need it"
+    )
     trajectory = path_of(np.random.default_rng(4))
     path = tmp_path / "0.hdf5"
     with h5py.File(path, "w") as file:
-        file["transforms/camera"] = rigid.inverse(trajectory.T_camera_from_world).astype("f4")
+        poses = rigid.inverse(trajectory.T_camera_from_world).astype("f4")
+        file.create_dataset("transforms/camera", data=poses, chunks=(8, 4, 4), compression="gzip")
+        file["transforms/leftHand"] = np.tile(np.eye(4, dtype="f4"), (40, 1, 1))
         file["camera/intrinsic"] = np.eye(3, dtype="f4")
+        file.attrs["llm_description"] = "fold a towel"
+    whole = path.read_bytes()
     back = device.read_egodex_hdf5(path, fps=60)
     assert_allclose(back.timestamps_s, np.arange(40) / 60)
     assert_same_poses(back.T_camera_from_world, trajectory.T_camera_from_world, atol=1e-5)
     assert_array_equal(device.read_egodex_intrinsics(path), np.eye(3))
-    path.write_bytes(b"no HDF5 at all")
-    with pytest.raises(ValueError, match="expected an HDF5 file"):
-        device.read_egodex_hdf5(path)
+    for part in (b"no HDF5 at all", whole[: len(whole) // 2], b""):
+        path.write_bytes(part)
+        with pytest.raises(ValueError, match=r"0\.hdf5: expected an HDF5 file"):
+            device.read_egodex_hdf5(path)
 
 
 def test_an_episode_of_a_device_camera_has_no_hands():

@@ -132,6 +132,7 @@ def test_converted_to_shards_with_and_without_mano(episode, folder, mano_dir, tm
     kept = Hot3DHands.load(tmp_path / f"hand_annotations/{episode.key}.npz")
     assert_array_equal(kept.pca, hot3d_hands(folder).pca)
     assert_array_equal(kept.transl, hot3d_hands(folder).transl)
+    assert kept.uid == episode.meta["uid"] == "P0003_c701bd11"
     (whole,) = convert("whole", "--mano", str(mano_dir), "--lossless")
     assert whole.presence.all()
     expected = from_hot3d(folder, mano_dir=mano_dir)
@@ -139,6 +140,31 @@ def test_converted_to_shards_with_and_without_mano(episode, folder, mano_dir, tm
     assert main(["verify", str(tmp_path), "--full"]) == 0
     assert set(corpus_files("bare", tmp_path).splits) == {"train"}
     capsys.readouterr()
+
+
+def test_a_withdrawn_recording_leaves_nothing_and_is_not_kept_again(folder, tmp_path, capsys):
+    other = shutil.copytree(folder, tmp_path / "P0009_00000000")
+    about = json.loads((other / "metadata.json").read_text())
+    named = {"recording_name": other.name, "participant_id": "P0009"}
+    (other / "metadata.json").write_text(json.dumps(about | named))
+    corpus = tmp_path / "corpus"
+    call = ["convert", "hot3d", str(folder), str(other), "-o", str(corpus), "--split", "train"]
+    call += ["--extra", "--quiet", "--config"]
+    assert main([*call, "one"]) == 0
+    assert main(["withdraw", str(corpus), "P0003_c701bd11", "--reason", "asked for"]) == 0
+    assert "removed hand_annotations/hot3d-aria-p0003_c701bd11-214-1.npz" in capsys.readouterr().out
+    assert main([*call, "two"]) == 0
+    kept = sorted(path.name for path in (corpus / "hand_annotations").iterdir())
+    assert kept == [f"{hot3d_key(other)}.npz"]
+    assert [e.meta["participant"] for e in CorpusReader(corpus, "two")] == ["P0009"]
+    assert main(["verify", str(corpus), "--full"]) == 0
+
+
+def test_without_metadata_the_folder_tells_the_participant_or_nobody_does(folder, tmp_path):
+    for name, person in (("P0003_c701bd11", "P0003"), ("walk", None)):
+        copy = shutil.copytree(folder, tmp_path / name)
+        (copy / "metadata.json").unlink()
+        assert from_hot3d(copy).meta.get("participant") == person
 
 
 def boxes(folder: Path, stream: str) -> list[tuple[int, int, np.ndarray]]:

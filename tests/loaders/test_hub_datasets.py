@@ -32,6 +32,7 @@ from mint_hub.loaders.schema import Episode, EpisodeError
 from mint_hub.loaders.shards import split_of, write_corpus
 from mint_hub.loaders.tar_layout import CorpusError
 from tests.episodes import make_episode
+from tests.lerobot_files import RootPlan, write_root
 from tests.loopback_hub import LoopbackHub
 
 ROOT = Path(__file__).parent.parent.parent
@@ -357,6 +358,25 @@ def test_published_lerobot_labels_are_read_through_episode(tmp_path):
     assert keys(mint_hub.load_dataset("all", "train", streaming=True, **options)) == keys(
         data["train"]
     )
+
+
+@pytest.mark.parametrize("dialect", ["camera", "world"])
+def test_a_root_without_validation_is_read_without_naming_a_split(tmp_path, dialect):
+    """Few videos rarely have one in fifty: then there is a train split, and no other."""
+    uids = [u for u in (f"v{i}" for i in range(99)) if split_of(u) == "train"][:5]
+    plan = RootPlan(dialect=dialect, episode_columns={"video_uid": uids})
+    write_root(tmp_path / "ego4d", plan)
+    expected = [e.key for e in from_lerobot(tmp_path / "ego4d")]
+    options = {"location": tmp_path, "cache_dir": tmp_path / "cache"}
+    for config in ("ego4d", "all"):
+        data = datasets.load_dataset("mint-ego", config, **options)
+        assert list(data) == ["train"]
+        assert data["train"]["key"] == expected
+        streamed = datasets.load_dataset("mint-ego", config, streaming=True, **options)
+        assert list(streamed) == ["train"]
+        assert [row["key"] for row in streamed["train"]] == expected
+    with pytest.raises(ValueError, match=r"validation.*train"):
+        datasets.load_dataset("mint-ego", "ego4d", split="validation", **options)
 
 
 REMOTE = """

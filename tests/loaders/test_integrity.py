@@ -56,6 +56,12 @@ def test_every_flipped_bit_is_named_with_what_is_lost(root):
     assert verify(root, "full").ok
 
 
+def test_a_reader_that_checks_samples_reads_no_flipped_bit(root):
+    row = faults.flipped_bits_read(root, "sample")
+    assert (row.cases, row.silent) == (200, 0), row
+    assert verify(root, "full").ok
+
+
 def test_a_report_says_it_in_words(root, split):
     path = split / "sample-train-00001.tar"
     keys = [sample.key for sample in faults.spans_of(path)]

@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -26,6 +27,7 @@ from mint_hub.loaders.lerobot import (
     to_lerobot,
 )
 from mint_hub.loaders.lerobot_columns import LABELS, columns_of
+from mint_hub.loaders.lerobot_files import open_root
 from tests.episodes import make_episode
 from tests.lerobot_files import (
     IMAGE_SIZE_HW,
@@ -82,10 +84,10 @@ def test_both_dialects_give_the_same_episodes(tmp_path):
         write_root(tmp_path / dialect, RootPlan(dialect=dialect))
     camera, world = (read(tmp_path / dialect) for dialect in DIALECTS)
     for a, b in zip(camera, world, strict=True):
-        assert replace(a, meta=b.meta).allclose(b, atol=1e-6)
+        assert replace(a, key=b.key, meta=b.meta).allclose(b, atol=1e-6)
         assert a.fov_vh_rad[0, 0] < a.fov_vh_rad[0, 1]
         differing = {k for k in a.meta if a.meta[k] != b.meta[k]}
-        assert differing == {"provenance"}
+        assert differing == {"provenance", "uid"}  # which name the root
 
 
 def test_says_where_an_episode_is_from(tmp_path):
@@ -107,6 +109,27 @@ def test_says_where_an_episode_is_from(tmp_path):
     assert origin["file"] == "data/chunk-000/file-001.parquet"
     assert origin["video"]["from_timestamp"] == found[2].timestamps_s[0] == 4.0
     np.testing.assert_allclose(np.diff(found[2].timestamps_s), 1 / 30)
+
+
+def test_a_root_is_known_by_what_it_holds(tmp_path):
+    """Not by where it lies; nor by what a user adds, or has not fetched yet."""
+    write_root(tmp_path / "a")
+    shutil.copytree(tmp_path / "a", tmp_path / "elsewhere/b")
+    write_root(tmp_path / "other", RootPlan(seed=5))  # same texts and lengths, another motion
+    write_root(tmp_path / "longer", RootPlan((12, 9, 20, 8, 16)))
+    names = [open_root(tmp_path / f).identity for f in ("a", "elsewhere/b", "other", "longer")]
+    assert len(set(names)) == 3
+    assert names[0] == names[1]
+    (tmp_path / "a/videos").mkdir()
+    (tmp_path / "a/videos/x.mp4").write_bytes(b"x")
+    (tmp_path / "a/data/chunk-000/file-002.parquet").unlink()
+    assert open_root(tmp_path / "a").identity == names[0]
+    episode = next(from_lerobot(tmp_path / "a"))
+    assert episode.meta["provenance"]["root"] == names[0]
+    assert str(tmp_path) not in json.dumps(episode.meta)
+    (tmp_path / "a" / FIRST).write_bytes(b"cut")
+    with pytest.raises(LeRobotError, match=r"file-000.parquet: expected a parquet file, got"):
+        next(from_lerobot(tmp_path / "a"))
 
 
 def test_text_is_atomic_segments_or_else_tasks(tmp_path):
@@ -135,14 +158,15 @@ def test_row_groups_do_not_matter(tmp_path, rows_per_group):
     write_root(tmp_path / "a", RootPlan(rows_per_group=rows_per_group, per_file=5))
     write_root(tmp_path / "b", RootPlan(per_file=1))
     for a, b in zip(read(tmp_path / "a"), read(tmp_path / "b"), strict=True):
-        assert replace(a, meta=b.meta).allclose(b, atol=0)
+        assert replace(a, key=b.key, meta=b.meta).allclose(b, atol=0)
 
 
 def test_chosen_episodes_only(tmp_path):
     write_root(tmp_path, RootPlan(first_episode=10))
     every = {e.key: e for e in read(tmp_path)}
     found = read(tmp_path, episodes=[13, 11])
-    assert [e.key for e in found] == ["ego4d-000011", "ego4d-000013"]
+    name = open_root(tmp_path).identity
+    assert [e.key for e in found] == [f"ego4d-{name}-000011", f"ego4d-{name}-000013"]
     assert all(e.allclose(every[e.key], atol=0) for e in found)
     with pytest.raises(LeRobotError, match=r"expected \[2\], got 5 episodes without"):
         from_lerobot(tmp_path, episodes=[2, 11])
@@ -165,7 +189,7 @@ def test_plain_lists_are_as_good_as_fixed_ones(tmp_path):
     plain = pa.array(table["cam_trans"].to_pylist(), pa.list_(pa.float64()))
     replace_column(path, "cam_trans", plain)
     for a, b in zip(read(tmp_path / "a"), read(tmp_path / "b"), strict=True):
-        assert replace(a, meta=b.meta).allclose(b, atol=0)
+        assert replace(a, key=b.key, meta=b.meta).allclose(b, atol=0)
 
 
 def test_reads_through_fsspec_and_no_further_than_asked(tmp_path):
@@ -199,10 +223,11 @@ for root in lerobot_roots("hf://datasets/org/labels"):
         done = subprocess.run(
             command, env=environment, cwd=REPOSITORY, capture_output=True, text=True, check=False
         )
+    name = open_root(tmp_path / "labels/ego4d/lerobot_v3").identity
     assert done.stdout.split() == [
         "hf://datasets/org/labels/ego4d/lerobot_v3",
-        "ego4d-000001",
-        "ego4d-000003",
+        f"ego4d-{name}-000001",
+        f"ego4d-{name}-000003",
     ], done.stderr
 
 

@@ -1,6 +1,8 @@
 """LeRobot roots in slices: the same shards as the stream, whichever process reads what."""
 
 import pickle
+import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,9 @@ import pytest
 
 from mint_hub.loaders import lerobot_slices
 from mint_hub.loaders.lerobot import LeRobotError, LeRobotSlices, from_lerobot, to_lerobot
+from mint_hub.loaders.lerobot_slices import splits_of
+from mint_hub.loaders.participants import group_of
+from mint_hub.loaders.reader import CorpusReader
 from mint_hub.loaders.shard_source import Sliced
 from mint_hub.loaders.shards import CorpusError, split_of, write_corpus
 from tests.corpus_faults import tree
@@ -105,6 +110,49 @@ def test_the_groups_of_our_own_roots_are_those_of_meta(tmp_path):
     seen = []
     slices_of(LeRobotSlices([tmp_path / "root"], keep=lambda *group: bool(seen.append(group))))
     assert seen == [(e.meta.get("uid") or e.key, e.meta.get("participant")) for e in made]
+
+
+def test_two_roots_of_one_source_have_no_key_and_no_video_in_common(tmp_path):
+    for name, seed in (("x", 0), ("y", 30)):
+        write_root(tmp_path / name, RootPlan(LENGTHS, seed=seed))
+    write(LeRobotSlices([tmp_path / "x", tmp_path / "y"]), tmp_path / "both")
+    found = list(CorpusReader(tmp_path / "both", "c", "train"))
+    assert len({e.key for e in found}) == len(found) == 2 * len(LENGTHS)
+    uids = [{e.meta["uid"] for e in from_lerobot(tmp_path / name)} for name in "xy"]
+    assert not uids[0] & uids[1]
+
+
+def test_a_root_that_comes_twice_is_named(tmp_path):
+    write_root(tmp_path / "x")
+    shutil.copytree(tmp_path / "x", tmp_path / "copy")
+    expected = f"got {tmp_path / 'x'} and {tmp_path / 'copy'}, which are the same root"
+    with pytest.raises(LeRobotError, match=re.escape(expected)):
+        write(LeRobotSlices([tmp_path / "x", tmp_path / "copy"]), tmp_path / "both")
+
+
+def test_how_a_root_is_called_changes_no_byte(tmp_path, monkeypatch):
+    root = tmp_path / "a/ego4d"
+    write_root(root, RootPlan(source=None))
+    shutil.copytree(root, tmp_path / "far/away/ego4d")
+    monkeypatch.chdir(root.parent)
+    places = (str(root), "ego4d", "./ego4d/", str(tmp_path / "far/away/ego4d"), f"file://{root}")
+    for number, place in enumerate(places):
+        write(LeRobotSlices([place]), tmp_path / str(number))
+    trees = [tree(tmp_path / str(number)) for number in range(len(places))]
+    assert all(files == trees[0] for files in trees)
+    assert not any(str(tmp_path).encode() in data for data in trees[0].values())
+
+
+def test_splits_are_those_that_episodes_fall_into(roots, tmp_path):
+    for root in roots:
+        seen = {split_of(*group_of(e.meta, e.key)) for e in from_lerobot(root)}
+        assert splits_of(root) == [s for s in ("train", "validation") if s in seen]
+    uids = [f"v{i}" for i in range(500)]
+    rare = [uid for uid in uids if split_of(uid) == "validation"][:5]
+    write_root(tmp_path / "both", RootPlan(episode_columns={"uid": [*uids[:4], rare[0]]}))
+    assert splits_of(tmp_path / "both") == ["train", "validation"]
+    write_root(tmp_path / "rare", RootPlan(episode_columns={"uid": rare}))
+    assert splits_of(tmp_path / "rare") == ["validation"]
 
 
 def test_a_source_travels_to_a_process_that_shares_nothing(roots):

@@ -5,6 +5,7 @@ import json
 import os
 import pickle
 import shutil
+from contextlib import suppress
 from dataclasses import replace
 
 import fsspec
@@ -225,6 +226,47 @@ def test_filtered_windows_are_of_the_chosen_episodes(written):
         assert reader[int(batch.index[k])].meta["source"] == "epic"
 
 
+@pytest.mark.parametrize(
+    ("filters", "message"),
+    [
+        ({"source": "Epic"}, r"source: expected some of \['ego4d', 'epic'\], got 'Epic'"),
+        ({"source": ["epic", "egodex"]}, r"source: expected some of .*, got 'egodex'"),
+        ({"source": 3}, "source: expected text, or several texts, got 3"),
+        ({"source": []}, r"source: expected text, or several texts, got \[\]"),
+        ({"source": ["epic", None]}, "source: expected text, or several texts, got"),
+        ({"presence": 3.0}, r"presence: expected a share of frames from 0 to 1.*, got 3\.0"),
+        ({"presence": -0.1}, r"presence: expected a share .*, got -0\.1"),
+        ({"presence": float("nan")}, "presence: expected a share .*, got nan"),
+        ({"presence": (0.5, 2)}, r"presence: expected a share .*, got \(0\.5, 2\)"),
+        ({"presence": (0.5, 0.5, 0.5)}, r"presence: expected a share .*, got \(0\.5, 0\.5, 0\.5\)"),
+        ({"presence": ()}, r"presence: expected one share, or one a hand, got \(\)"),
+        ({"presence": "half"}, "presence: expected a share .*, got 'half'"),
+        ({"min_frames": -4}, "min_frames: expected a whole number of at least 0, got -4"),
+        ({"min_frames": "a"}, "min_frames: expected a whole number of at least 0, got 'a'"),
+        ({"min_frames": 2.5}, r"min_frames: expected a whole number of at least 0, got 2\.5"),
+        ({"text": 3}, "text: expected text, got 3"),
+        ({"text": ["open"]}, r"text: expected text, got \['open'\]"),
+        ({"where": ["source"]}, r"where: expected \(column, op, value\) each, got 'source'"),
+    ],
+)
+def test_filters_that_nothing_can_pass_are_named(written, filters, message):
+    with pytest.raises(ValueError, match=message):
+        CorpusReader(written, "ego4d", "train", **filters)
+
+
+def test_numpy_numbers_are_as_good(written):
+    plain = CorpusReader(written, "ego4d", "train", min_frames=33, presence=(0.5, 0))
+    same = {"min_frames": np.int64(33), "presence": np.array([0.5, 0])}
+    assert len(CorpusReader(written, "ego4d", "train", **same)) == len(plain) > 0
+
+
+def test_an_episode_is_asked_for_by_a_whole_number(written):
+    reader = CorpusReader(written, "ego4d", "train")
+    assert reader.key(0) == reader[np.int64(0)].key
+    with pytest.raises(TypeError, match=r"episode: expected a whole number, got 1\.0"):
+        reader[1.0]
+
+
 def test_wrong_filters_are_named(written):
     with pytest.raises(CorpusError, match="expected column colour"):
         CorpusReader(written, "ego4d", "train", where=[("colour", "==", 1)])
@@ -246,7 +288,12 @@ def test_wrong_filters_are_named(written):
         (lambda r: r.windows([0, NUM], [0, 0], 2), "indices: expected 0 .. 39, got 0 .. 40"),
         (lambda r: r.windows([0, 1], [0], 2), "starts: expected one for each"),
         (lambda r: r.random_windows(4, 61), "expected an episode of 61 frames"),
-        (lambda r: r.random_windows(4, 0), "length: expected at least 1"),
+        (lambda r: r.random_windows(4, 0), "length: expected a whole number of at least 1, got 0"),
+        (lambda r: r.random_windows(-1, 4), "batch: expected a whole number of at least 1, got -1"),
+        (lambda r: r.windows([0], [0.5], 4), "starts: expected whole numbers, got float64"),
+        (lambda r: r.windows([0.0], [0], 4), "indices: expected whole numbers, got float64"),
+        (lambda r: r.windows([0], [0], 4.0), r"length: expected a whole number, got 4\.0"),
+        (lambda r: r.window(0, 1.5, 4), "starts: expected whole numbers"),
         (lambda r: r.stream(4, 61), "length: expected an episode of 61"),
     ],
 )
@@ -347,6 +394,49 @@ def test_a_damaged_json_is_skipped_too(corpus):
     reader = CorpusReader(corpus, "ego4d", "train", on_error="skip")
     assert key not in [episode.key for episode in reader]
     assert reader.num_skipped == 1
+
+
+def test_by_sample_no_flipped_bit_is_read_and_by_size_most_are(corpus):
+    shards = shards_of(corpus)
+    clean = {episode.key: episode for episode in CorpusReader(corpus, "ego4d")}
+    rng, silent = np.random.default_rng(0), 0
+    for _ in range(30):
+        path = shards[int(rng.integers(len(shards)))]
+        whole = path.read_bytes()
+        at = int(rng.integers(len(whole) - 1024))  # not in the end of the archive
+        changed = bytearray(whole)
+        changed[at] ^= 1 << int(rng.integers(8))
+        path.write_bytes(changed)
+        with pytest.raises(ValueError, match=path.name):
+            list(CorpusReader(corpus, "ego4d", verify="sample"))
+        reader = CorpusReader(corpus, "ego4d", verify="sample", on_error="skip")
+        left = list(reader)
+        assert len(left) == NUM - 1 == sum(1 for _ in reader.iter_arrays())
+        assert reader.num_skipped == 1
+        assert all(e.allclose(clean[e.key], atol=0) for e in left)
+        with suppress(ValueError):
+            silent += len(list(CorpusReader(corpus, "ego4d"))) == NUM
+        path.write_bytes(whole)
+    assert silent > 15, "by size alone a changed number is not seen"
+    assert len(list(CorpusReader(corpus, "ego4d", verify="sample"))) == NUM
+
+
+def test_by_sample_windows_are_checked_and_so_is_the_table(corpus):
+    reader = CorpusReader(corpus, "ego4d", min_frames=20)
+    path, data = shards_of(corpus)[0], shards_of(corpus)[0].read_bytes()
+    at = data.index(npy_header("<f4", int(reader.num_frames[0]), 17)) + 500
+    path.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
+    CorpusReader(corpus, "ego4d", min_frames=20).window(0, 0, 4)
+    by_sample = CorpusReader(corpus, "ego4d", min_frames=20, verify="sample")
+    again = pickle.loads(pickle.dumps(by_sample))
+    for each in (by_sample, again):
+        with pytest.raises(CorpusError, match=rf"{path.name}, episode .*: expected bytes of crc32"):
+            each.windows([0], [0], 4)
+    path.write_bytes(data)
+    table = corpus / "ego4d/train/episodes.parquet"
+    table.write_bytes(table.read_bytes()[:-1] + b"X")
+    with pytest.raises(CorpusError, match=r"episodes\.parquet"):
+        CorpusReader(corpus, "ego4d", verify="sample")
 
 
 def test_swapped_shards_are_seen_even_where_sizes_agree(corpus):

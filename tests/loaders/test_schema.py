@@ -101,6 +101,8 @@ def _with(array, index, value):
             "'x' end: expected at most T",
         ),
         ("text", lambda _: ({"id": "x"},), "expected TextSegments"),
+        ("text", lambda _: None, "text: expected a tuple of TextSegments, got None"),
+        ("text", lambda _: 3, "text: expected a tuple of TextSegments, got 3"),
         (
             "meta",
             lambda _: {"a": [{"b": float("nan")}]},
@@ -361,6 +363,8 @@ class _Bomb:
         ("", {"surprise": 1}, "surprise: expected a field of an episode"),
         ("", {"key": np.array([_Bomb()], dtype=object)}, "key: expected a plain npy array"),
         ("", {"schema_version": 1.5}, "schema_version: expected a whole number"),
+        ("", {"schema_version": 0}, "schema_version: expected at least 1, got 0"),
+        ("", {"schema_version": -1}, "schema_version: expected at least 1, got -1"),
         (
             "",
             {"presence": np.zeros((3, 2), bool)},

@@ -3,6 +3,7 @@ import os
 import signal
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -278,8 +279,15 @@ def test_a_split_that_exists_is_left_alone(tmp_path):
 
 
 def test_a_key_that_comes_twice_is_refused(tmp_path):
-    with pytest.raises(CorpusError, match="to have its own, got 'e-0' twice"):
+    with pytest.raises(CorpusError, match="to have its own, got 'e-0' twice: leave out the input"):
         write([*EPISODES[:3], EPISODES[0]], tmp_path)
+
+
+@pytest.mark.parametrize("num_procs", [0, -1, 1.5, "2"])
+def test_a_wrong_number_of_processes_is_refused_before_anything_is_written(tmp_path, num_procs):
+    with pytest.raises(ValueError, match="num_procs: expected a whole number of at least 1, got"):
+        write(EPISODES[:3], tmp_path, num_procs=num_procs)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("nothing", [[], iter(())])
@@ -337,3 +345,17 @@ def test_an_error_in_a_process_arrives_and_a_death_is_told():
         list(in_order(abs, [1, "x"], 2))
     with pytest.raises(CorpusError, match="a worker process died"):
         list(in_order(os._exit, [3], 2))
+
+
+@pytest.mark.parametrize("num_procs", [1, 2])
+@pytest.mark.parametrize("format", ["compact", "lossless"])
+def test_scores_that_are_not_kept_are_counted_and_told(tmp_path, caplog, format, num_procs):
+    made = [make_episode(6, seed=i, key=f"s-{i}") for i in range(5)]
+    made[2] = replace(made[2], presence_score=None)
+    options = {"format": format, "num_procs": num_procs}
+    told = write_corpus(made, tmp_path, "without", "train", **options)
+    assert told.lost_scores == 4
+    (line,) = caplog.messages
+    assert "without/train: presence scores of 4 episodes are not in the shards" in line
+    assert write_corpus(made, tmp_path, "with", "train", extra=True, **options).lost_scores == 0
+    assert len(caplog.messages) == 1

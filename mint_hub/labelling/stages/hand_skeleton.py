@@ -100,7 +100,8 @@ def _turning_axes(angles_rad: Floats, turned: Floats) -> Floats:
     axes = np.broadcast_to(_axes(), (len(angles_rad), NUM_ANGLES, 3)).copy()
     bent = (turned[:, list(ANGLE_JOINTS)] @ axes[..., None]).squeeze(-1)
     axes[:, FLEXION] = bent[:, FLEXION]
-    axes[:, THUMB_BASE] = np.swapaxes(left_jacobian(angles_rad[:, THUMB_BASE]), 1, 2)
+    thumb = np.swapaxes(left_jacobian(angles_rad[:, THUMB_BASE]), 1, 2)
+    axes[:, THUMB_BASE] = thumb @ _axes()[THUMB_BASE]
     return axes
 
 

@@ -5,7 +5,9 @@ runs the model where the camera came from elsewhere; `MintIntrinsics` freezes wh
 of the field of view over the video. Known intrinsics correct the hands' depth, as in inference.
 """
 
-from dataclasses import dataclass, replace
+import hashlib
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -17,7 +19,15 @@ from mint_hub.inference.runner import MintRunner, RunSettings
 from mint_hub.labelling.frames import clip_frames
 from mint_hub.labelling.readiness import Lack, check
 from mint_hub.labelling.records import CameraPath, Clip, Hands, Intrinsics, Video
-from mint_hub.labelling.stage import Outcome, Resources, report_of, reported, require
+from mint_hub.labelling.stage import (
+    LOCAL,
+    NotReadyError,
+    Outcome,
+    Resources,
+    report_of,
+    reported,
+    require,
+)
 from mint_hub.loaders.schema import Episode
 from mint_hub.model.modeling_mint import MintModel
 from mint_hub.model.processing_mint import MintProcessor
@@ -36,14 +46,16 @@ class MintSettings:
         presence_threshold: a hand is present where its logit is at least this.
         batch_size: windows that go through the network at once.
         windows: how many `MintIntrinsics` looks at, spread over the video.
+        content: of a folder, which files it holds, found by the stage: others, other results.
 
     """
 
-    model: str = ""
+    model: str = field(default="", metadata=LOCAL)
     device: str = "cpu"
     presence_threshold: float = 0.0
     batch_size: int = 1
     windows: int = 4
+    content: str = ""
 
 
 class MintStage:
@@ -54,7 +66,8 @@ class MintStage:
     resources: Resources = Resources(cpus=2.0, memory_gib=8.0)
 
     def __init__(self, settings: MintSettings | None = None) -> None:
-        self.settings = settings or MintSettings()
+        settings = settings or MintSettings()
+        self.settings = replace(settings, content=_content(settings.model))
         self._runner: MintRunner | None = None
         if self.settings.device.startswith("cuda"):
             self.resources = Resources(cpus=1.0, gpus=1.0, memory_gib=8.0)
@@ -77,15 +90,17 @@ class MintStage:
         """Return the loaded model.
 
         Raises:
-            NotReadyError: no checkpoint is named.
-            OSError: there is none at that name.
+            NotReadyError: no checkpoint is named, or none can be read at that name.
             ValueError: no such device.
 
         """
         if self._runner is None:
             check(self.lacks())
             device = available_device(self.settings.device)
-            model: Any = MintModel.from_pretrained(self.settings.model)
+            try:
+                model: Any = MintModel.from_pretrained(self.settings.model)
+            except OSError as error:
+                raise NotReadyError(f"MINT checkpoint {self.settings.model}: {error}") from error
             processor = MintProcessor.for_config(model.config)
             self._runner = MintRunner(model.eval().to(device), processor)
         return self._runner
@@ -205,6 +220,20 @@ def windows_of(clips: tuple[Clip, ...], window: int, count: int) -> list[tuple[C
     ]
     count = min(count, len(every))
     return [every[int((i + 0.5) * len(every) / count)] for i in range(count)]
+
+
+def _content(model: str) -> str:
+    """Return a hash of a folder's configuration and of its weights' sizes and times."""
+    if not model or not Path(model).is_dir():
+        return model
+    digest = hashlib.sha256()
+    for path in sorted(Path(model).glob("*")):
+        if path.suffix == ".json":
+            digest.update(path.read_bytes())
+        elif path.suffix == ".safetensors":
+            stat = path.stat()
+            digest.update(f"{path.name} {stat.st_size} {stat.st_mtime_ns}".encode())
+    return digest.hexdigest()[:16]
 
 
 def _pinhole(clip: Clip) -> NDArray[np.float64] | None:

@@ -28,7 +28,8 @@ class SfmSettings:
 
     Attributes:
         max_side_px: frames whose longer side is longer are shrunk to it.
-        threads: for matching; the result does not depend on it.
+        threads: for matching, and the cores that one worker occupies; the result does not depend on
+            it. Many workers do more with one thread each.
         python: an interpreter that has the packages, instead of one made for them.
         timeout_s: longest time for one window or clip.
 

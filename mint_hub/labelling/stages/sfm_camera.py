@@ -91,6 +91,7 @@ class SfmIntrinsics:
     def __init__(self, settings: SfmIntrinsicsSettings | None = None) -> None:
         self._settings = settings or SfmIntrinsicsSettings()
         self._worker = SfmWorker(self._settings)
+        self.resources = replace(self.resources, cpus=float(self._settings.threads))
 
     @property
     def settings(self) -> SfmIntrinsicsSettings:
@@ -176,6 +177,7 @@ class SfmCamera:
     def __init__(self, settings: SfmCameraSettings | None = None) -> None:
         self._settings = settings or SfmCameraSettings()
         self._worker = SfmWorker(self._settings)
+        self.resources = replace(self.resources, cpus=float(self._settings.threads))
 
     @property
     def settings(self) -> SfmCameraSettings:
