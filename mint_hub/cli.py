@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mint_hub import cli_corpus, cli_evaluate, cli_label, cli_synth
+from mint_hub import cli_corpus, cli_evaluate, cli_label, cli_synth, cli_train
 from mint_hub._version import __version__
 
 if TYPE_CHECKING:
@@ -56,6 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     cli_synth.add_synth(commands)
     cli_corpus.add_withdraw(commands)
     cli_label.add_label(commands)
+    cli_train.add_train(commands)
     cli_evaluate.add_evaluate(commands)
     cli_evaluate.add_compare(commands)
     return parser

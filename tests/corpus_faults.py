@@ -3,7 +3,7 @@
 Every function does one kind of damage many times and returns a ``Row``. A case counts as detected
 when the report names the damaged file and exactly the episodes that are lost with it, and as
 resumed when a writer that was stopped, called again, gives the bytes of one that was not.
-``python -m tests.corpus_faults`` prints the table.
+``python -m tests.corpus_faults`` prints the table, `benchmarks/faults.py` keeps it.
 """
 
 import builtins
@@ -15,6 +15,7 @@ import signal
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
@@ -25,11 +26,14 @@ from mint_hub.loaders import shards
 from mint_hub.loaders.index import Index
 from mint_hub.loaders.integrity import verify
 from mint_hub.loaders.manifest import split_folders
+from mint_hub.loaders.reader import CorpusReader
 from mint_hub.loaders.shards import write_corpus
 from mint_hub.loaders.tar_layout import Sample, samples_in
 from tests.episodes import make_episode
 
-EPISODES = [make_episode(6 + i % 3, seed=i, key=f"e-{i}") for i in range(9)]
+EPISODES = [
+    replace(make_episode(6 + i % 3, seed=i, key=f"e-{i}"), presence_score=None) for i in range(9)
+]
 SHARD_BYTES = 24_000
 BIT_FLIPS = 200
 KILLS = 12
@@ -110,6 +114,31 @@ def flipped_bits(root: Path) -> Row:
         hits += seen(root, "full", path.name, "checksum", lost)
         path.write_bytes(clean)
     return Row("bit flipped in any file (full)", BIT_FLIPS, hits)
+
+
+def flipped_bits_read(root: Path, verify: str) -> Row:
+    """Flip random bits of samples and read all of them: detected where reading raises.
+
+    A flip that reading survives is silent where an episode differs; bytes that say nothing (the
+    padding of the archive) count as detected, since nothing is lost.
+    """
+    path = Index.load(root / "sample/train").paths[1]
+    clean, span = path.read_bytes(), spans_of(path)
+    episodes = list(CorpusReader(root, "sample"))
+    rng = np.random.default_rng(1)
+    hits = 0
+    for _ in range(BIT_FLIPS):
+        data = bytearray(clean)
+        data[int(rng.integers(span[-1].offset + span[-1].size))] ^= 1 << int(rng.integers(8))
+        path.write_bytes(data)
+        try:
+            read = list(CorpusReader(root, "sample", verify=verify))
+        except ValueError as error:
+            hits += path.name in str(error)
+        else:
+            hits += all(a.allclose(b, atol=0) for a, b in zip(read, episodes, strict=True))
+    path.write_bytes(clean)
+    return Row(f"bit flipped in a sample, read (verify={verify!r})", BIT_FLIPS, hits)
 
 
 def missing_files(root: Path, level: str) -> Row:
@@ -295,6 +324,7 @@ def table(folder: Path) -> list[Row]:
     faults: list[Callable[[], Row]] = [
         *(lambda v=v: cut_at_member_boundaries(root, v) for v in ("size", "full")),
         lambda: flipped_bits(root),
+        lambda: flipped_bits_read(root, "sample"),
         *(lambda v=v: missing_files(root, v) for v in ("size", "full")),
         *(lambda v=v: swapped_shards(root, v) for v in ("size", "full")),
         lambda: killed_at_every_rename(folder / "renames", whole),

@@ -2,8 +2,9 @@
 
 Two hands go through it: the template that comes with mint-hub (``shape_space`` "mint", no licence
 needed), and the user's own MANO files ("mano"). Shape numbers mean nothing across the two. A
-right hand rests with fingers along -x, palm facing -y, thumb towards +z; a left hand is mirrored
-across x.
+right hand rests with fingers about -x, palm about -y, thumb about +z, a little turned towards the
+little finger as MANO's is; a left hand is mirrored across x.
+
 Skinning follows Loper et al. 2015 (SMPL, eq. 2-7) with the joint tree of Romero et al. 2017 (MANO),
 except that a state's translation is the position of the wrist joint itself.
 """

@@ -160,12 +160,15 @@ class MintHandHead(nn.Module):
         step = self.read(self.increment_heads, x)
         translation, orientation, pose, shape = step.split([n for _, n in HAND_PARTS.values()], -1)
         before = hand_state.unpack(state)
-        return HandState.from_matrices(
-            before.translation + translation,
-            before.orientation(check=False) @ bounded_rotation(orientation),
-            before.joint_rotations(check=False) @ bounded_rotation(pose.unflatten(-1, (15, 3))),
-            before.shape_params + shape,
-        ).pack()
+        with torch.autocast(
+            state.device.type, enabled=False
+        ):  # rotations compose in full precision
+            return HandState.from_matrices(
+                before.translation + translation,
+                before.orientation(check=False) @ bounded_rotation(orientation),
+                before.joint_rotations(check=False) @ bounded_rotation(pose.unflatten(-1, (15, 3))),
+                before.shape_params + shape,
+            ).pack()
 
 
 class MintPresenceHead(nn.Module):

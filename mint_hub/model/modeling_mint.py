@@ -9,6 +9,7 @@ attention within a frame and attention over the whole window. Four heads read it
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -23,6 +24,7 @@ from transformers.utils import ModelOutput, TransformersKwargs
 from transformers.utils.generic import can_return_tuple, merge_with_config_defaults
 from transformers.utils.output_capturing import OutputRecorder, capture_outputs
 
+from ..geometry.hand_model import HandModel
 from .configuration_mint import MintConfig
 from .conversion_mint import load_lingbot, register_conversion
 from .heads_mint import (
@@ -44,6 +46,7 @@ from .layers_mint import (
     rotary_positions,
 )
 from .loading_mint import load_checked
+from .losses_mint import RELEASE_STAGE_1, LossCase, LossSettings, total
 from .saving_mint import SavesCode
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
@@ -56,7 +59,7 @@ class MintOutput(ModelOutput):
 
     Attributes:
         loss: scalar, when labels are given.
-        losses: every term of the loss by name, when labels are given.
+        losses: every term of the loss by name, unweighted, when labels are given.
         last_hidden_state: (B, T, P, 2C) tokens of the last frame and global layers, joined.
         pose_encoding: (B, T, 9) camera state: translation 3, quaternion xyzw 4 (not normalised),
             field of view (vertical, horizontal); world-to-camera, OpenCV axes.
@@ -282,10 +285,17 @@ class MintPreTrainedModel(SavesCode, PreTrainedModel):
 
 
 class MintModel(MintPreTrainedModel):
-    """The whole network: patch encoder, aggregator, camera, fov, hand and presence heads."""
+    """The whole network: patch encoder, aggregator, camera, fov, hand and presence heads.
+
+    Attributes:
+        loss_settings: which terms the loss has when labels are given; the release's first stage.
+        loss_hand_model: turns hands into keypoints for the loss; None: its shape space's default.
+    """
 
     def __init__(self, config: MintConfig):
         super().__init__(config)
+        self.loss_settings = LossSettings(RELEASE_STAGE_1)
+        self.loss_hand_model: HandModel | None = None
         self.encoder = MintEncoder(config)
         self.aggregator = MintAggregator(config)
         self.camera_head = MintCameraHead(config)
@@ -332,7 +342,7 @@ class MintModel(MintPreTrainedModel):
         pixel_values: Tensor | None = None,
         patch_tokens: Tensor | None = None,
         grid_hw: tuple[int, int] | None = None,
-        labels: None = None,
+        labels: Mapping[str, Tensor] | None = None,
         **kwargs: Unpack[TransformersKwargs],
     ) -> MintOutput:
         """Run windows of frames, given as pixels or as patch tokens from `encode_frames`.
@@ -341,17 +351,18 @@ class MintModel(MintPreTrainedModel):
             pixel_values: (B, T, 3, H, W) RGB in [0, 1]; H and W multiples of the patch size.
             patch_tokens: (B, T, N, C), instead of pixel_values.
             grid_hw: rows and columns of patches, with patch_tokens; the configuration's by default.
-            labels: reserved for training, which is not part of this version.
+            labels: the truth, by name (`LossCase`): ``pose_encoding`` (B, T, 9) relative to the
+                first frame, ``hand_state`` (B, T, 2, 109), ``presence`` (B, T, 2), and optional
+                ones.
 
         Returns:
             MintOutput: see its attributes. The world is the camera of the window's first frame, as
             far as the network has learnt it (frame 0 comes out near the identity, not exactly).
 
         Raises:
-            ValueError: neither or both inputs, or shapes that do not fit the configuration.
+            ValueError: neither or both inputs, shapes that do not fit the configuration, or labels
+                that lack something or hold NaN.
         """
-        if labels is not None:
-            raise ValueError("labels: losses are not part of this version; expected None")
         if (pixel_values is None) == (patch_tokens is None):
             raise ValueError(
                 "expected exactly one of pixel_values (B, T, 3, H, W) and patch_tokens"
@@ -381,13 +392,29 @@ class MintModel(MintPreTrainedModel):
         presence = self.presence_head(
             tokens[:, :, self.config.num_special_tokens :], implementation
         )
-        return MintOutput(
+        output = MintOutput(
             last_hidden_state=tokens,
             pose_encoding=torch.cat([poses[-1], fov.to(poses[-1].dtype)], -1),
             camera_iterations=poses,
             hand_state=hands[-1],
             initial_hand_state=hands[0],
             presence_logits=presence,
+        )
+        if labels is not None:
+            output.loss, output.losses = total(self._loss_case(output, labels, grid_hw))
+        return output
+
+    def _loss_case(
+        self, output: MintOutput, labels: Mapping[str, Tensor], grid_hw: tuple[int, int]
+    ) -> LossCase:
+        patch = self.config.patch_size
+        return LossCase(
+            {name: output[name] for name in ("pose_encoding", "hand_state", "presence_logits")},
+            labels,
+            self.loss_settings,
+            image_size_hw=(grid_hw[0] * patch, grid_hw[1] * patch),
+            shape_space=self.config.shape_space,
+            hand_model=self.loss_hand_model,
         )
 
     def _check_pixels(self, pixel_values: Tensor) -> None:

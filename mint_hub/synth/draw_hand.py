@@ -18,7 +18,7 @@ from mint_hub.conventions import JOINT_NAMES, Side
 from mint_hub.geometry.hand_model import HandModel
 from mint_hub.geometry.hand_state import HandState
 from mint_hub.geometry.rotations import rotvec_to_matrix
-from mint_hub.synth.hand_anatomy import SPLAY_DEG, THUMB_DIRECTIONS, THUMB_PALMAR
+from mint_hub.synth.hand_anatomy import REST_TURN, SPLAY_DEG, THUMB_DIRECTIONS, THUMB_PALMAR
 from mint_hub.synth.raster import fill, vertex_normals
 
 PANEL: Final = 210
@@ -35,7 +35,7 @@ def pose(
     spread: dict[str, float] | None = None,
     thumb: tuple[Sequence[float], float, float] = ((0, 0, 0), 0, 0),
 ) -> np.ndarray:
-    """Joint rotations (15, 3, 3) of a right hand from angles in degrees.
+    """Joint rotations (15, 3, 3) of a right hand from angles in degrees, about its straight axes.
 
     Args:
         curl: flexion of a finger's three joints, towards the palm.
@@ -60,7 +60,7 @@ def pose(
     rotations[JOINT_NAMES.index("thumb1")] = rotvec_to_matrix(np.deg2rad(thumb[0]))
     for joint, flexion in zip(("thumb2", "thumb3"), thumb[1:], strict=True):
         rotations[JOINT_NAMES.index(joint)] = rotvec_to_matrix(np.deg2rad(flexion) * bend)
-    return rotations[1:]
+    return REST_TURN @ rotations[1:] @ REST_TURN.T
 
 
 def _all(*angles: float) -> dict[str, Sequence[float]]:

@@ -1,7 +1,8 @@
 """The anatomy of the licence-free hand: measured bones, and the flesh modelled around them.
 
-Millimetres, right hand, MANO's rest axes. The measurements and their sources are named in
-:mod:`mint_hub.synth.make_hand`.
+Millimetres, right hand, its own straight axes: the forearm along x, fingers along -x, palm facing
+-y, thumb towards +z. `REST_TURN` leads from them to the axes in which the template rests. The
+measurements and their sources are named in :mod:`mint_hub.synth.make_hand`.
 """
 
 from __future__ import annotations
@@ -13,7 +14,34 @@ from typing import Final
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from mint_hub.conventions import Side
+from mint_hub.geometry.rotations import rotvec_to_matrix
 from mint_hub.synth.hand_surface import round_cone, smooth_min
+
+REST_TURN_DEG: Final = (-2.0, -9.5, 3.5)
+"""How the template rests, from the straight axes: a rotation vector about the wrist, degrees.
+
+MANO's resting hand lies turned in its own axes, towards the little finger. Measured: VITRA's
+annotation of an Ego4D clip gives joints, wrist and joint rotations of a MANO right hand, which
+leave constant bones; they put the knuckles of index, middle, ring and little finger at about
+(-92, -5, 22), (-99, -1, -3), (-85, -4, -28) and (-72, -11, -46) mm from the wrist. Laid on the
+directions of those four, the straight hand turns by about (-3, -8.5, 3) degrees; fitted to the
+annotated joints, where fingers and thumb count too, by about (-1, -10, 4). This is the middle.
+"""
+
+REST_TURN: Final = np.asarray(rotvec_to_matrix(np.deg2rad(REST_TURN_DEG)), np.float64)
+"""R_rest_from_straight (3, 3) of a right hand."""
+
+
+def straight_axes(side: Side) -> np.ndarray:
+    """R_rest_from_straight (3, 3) of either hand.
+
+    Columns are where the forearm of a right hand (the fingers of a left one), the back of the hand
+    and the side of the thumb lie in the axes of a hand state.
+    """
+    mirror = np.diag([-1.0 if side == "left" else 1.0, 1.0, 1.0])
+    return mirror @ REST_TURN @ mirror
+
 
 FINGERS: Final = ("index", "middle", "pinky", "ring", "thumb")
 """In the order of conventions.JOINT_NAMES."""
@@ -89,7 +117,7 @@ class Finger:
 
 
 def fingers() -> dict[str, Finger]:
-    """Place the five fingers of the mean hand at rest, millimetres."""
+    """Place the five fingers of the mean hand, straight, millimetres."""
     made: dict[str, Finger] = {}
     for name in FINGERS:
         if name == "thumb":
@@ -107,7 +135,7 @@ def fingers() -> dict[str, Finger]:
 
 
 def hand_distance(points: np.ndarray, hand: dict[str, Finger]) -> np.ndarray:
-    """Signed distance of the resting hand, millimetres, (N, 3) -> (N,)."""
+    """Signed distance of the straight hand, millimetres, (N, 3) -> (N,)."""
     digits = np.full(len(points), 1e3)
     for name in ("index", "middle", "ring", "pinky"):
         digits = smooth_min(digits, finger_distance(points, hand[name], 0), 1.2)

@@ -3,7 +3,8 @@
 Angles are degrees, and the same for a left and a right hand: of index, middle, pinky and ring
 finger each the flexion of its three joints and its spread (positive towards the thumb), then the
 rotation vector of the base of the thumb (x opposes it to the fingers, -y closes it to the palm) and
-the flexion of its other two joints. `HandProxy` skins a few hundred points of the hand, many poses
+the flexion of its other two joints. They turn about the axes of the straight hand
+(`hand_anatomy.REST_TURN`). `HandProxy` skins a few hundred points of the hand, many poses
 at once, which is what fitting a grasp needs.
 """
 
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from mint_hub.conventions import JOINT_NAMES, Side
 from mint_hub.geometry.hand_model import HandModel, chain
 from mint_hub.geometry.rotations import rotvec_to_matrix
-from mint_hub.synth.hand_anatomy import SPLAY_DEG, THUMB_DIRECTIONS, THUMB_PALMAR
+from mint_hub.synth.hand_anatomy import REST_TURN, SPLAY_DEG, THUMB_DIRECTIONS, THUMB_PALMAR
 
 __all__ = ["DIGITS", "LIMITS_DEG", "NUM_ANGLES", "POSTURES", "HandProxy", "joint_rotations"]
 
@@ -61,7 +62,8 @@ def joint_rotations(angles_deg: Floats) -> Floats:
     thumb = np.concatenate(
         [angles[..., None, 16:19], angles[..., 19:, None] * _THUMB_BEND], -2
     )  # (..., 3, 3)
-    return np.concatenate([flexion.reshape(*leading, 12, 3, 3), rotvec_to_matrix(thumb)], -3)
+    straight = np.concatenate([flexion.reshape(*leading, 12, 3, 3), rotvec_to_matrix(thumb)], -3)
+    return REST_TURN @ straight @ REST_TURN.T
 
 
 def _posture(
@@ -158,8 +160,9 @@ class HandProxy:
         asset = (model or HandModel.template()).right
         rest = asset.template + asset.shape_directions @ np.asarray(shape_params, float)
         segment = asset.skin_weights.argmax(1)
-        pads = [_pad(asset.template, segment, d) for d in range(len(DIGITS))]
-        palm = _palm_pad(asset.template, segment)
+        straight = asset.template @ REST_TURN
+        pads = [_pad(straight, segment, d) for d in range(len(DIGITS))]
+        palm = _palm_pad(straight, segment)
         sparser = np.where(segment == 0, 0.4, 1.0)  # the palm needs fewer points than fingers
         chosen = _spread_out(asset.template, np.concatenate([*pads, palm]), count, sparser)
         place = {int(v): i for i, v in enumerate(chosen)}

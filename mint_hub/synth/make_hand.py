@@ -11,8 +11,10 @@ or copied from another hand model; the measurements are published means:
   the sexes taken as 0.945 of the men's;
 - the spread of hand length and breadth: the same survey (about 6 % with both sexes together).
 
-The skeleton rests in MANO's axes: fingers along -x, palm facing -y, thumb towards +z, the wrist at
-the origin. The modelling is in millimetres; the file is in metres.
+The hand is modelled straight, with the fingers along -x, the palm facing -y, the thumb towards +z
+and the wrist at the origin, in millimetres. The file is in metres, and everything in it is turned
+as MANO's resting hand lies in those axes (`hand_anatomy.REST_TURN`), so that rotations mean the
+same.
 """
 
 from __future__ import annotations
@@ -29,7 +31,14 @@ import numpy as np
 
 from mint_hub.assets import asset_path
 from mint_hub.geometry.hand_asset import HandAsset, save_hand_asset
-from mint_hub.synth.hand_anatomy import CARPAL_MM, FINGERS, Finger, fingers, hand_distance
+from mint_hub.synth.hand_anatomy import (
+    CARPAL_MM,
+    FINGERS,
+    REST_TURN,
+    Finger,
+    fingers,
+    hand_distance,
+)
 from mint_hub.synth.hand_surface import (
     collapse_edges,
     is_closed,
@@ -44,7 +53,7 @@ NUM_VERTICES: Final = 2400
 
 
 def surface(hand: dict[str, Finger]) -> tuple[np.ndarray, np.ndarray]:
-    """Mesh the resting hand: vertices (V, 3) millimetres and outward faces (F, 3)."""
+    """Mesh the straight hand: vertices (V, 3) millimetres and outward faces (F, 3)."""
     distance = partial(hand_distance, hand=hand)
     low, high = np.array([-195.0, -55.0, -75.0]), np.array([45.0, 35.0, 105.0])
     vertices, faces = surface_net(distance, low + 0.37, high, CELL_MM)
@@ -129,7 +138,7 @@ class Growth:
     """How the pieces of a hand grow for a unit of one shape number; all are relative changes.
 
     Attributes:
-        palm: along x, y and z, of the palm, the wrist and where the fingers start.
+        palm: along the straight x, y and z, of the palm, the wrist and where the fingers start.
         length: of a finger's three bones.
         girth: of a finger around its three bones.
         depth: of the fingers, along y alone.
@@ -227,20 +236,28 @@ def make_hand(mesh: tuple[np.ndarray, np.ndarray] | None = None) -> HandAsset:
     """Make the whole right hand, metres; the same every time.
 
     Args:
-        mesh: vertices (V, 3) millimetres and faces (F, 3) to dress; modelled and meshed without it.
+        mesh: straight vertices (V, 3) millimetres and faces (F, 3) to dress; modelled and meshed
+            without it.
 
     """
     hand = fingers()
     vertices, faces = surface(hand) if mesh is None else mesh
     weights = skin_weights(vertices, faces, hand)
     directions, joint_directions = shape_directions(vertices, weights, hand)
-    template = (vertices / 1000).astype(np.float32).astype(np.float64)
-    directions = (directions / 1000).astype(np.float16).astype(np.float64)
-    joints = joint_positions(hand)
-    regressor = joint_regressor(template, directions, joints / 1000, joint_directions / 1000)
+    template = (vertices @ REST_TURN.T / 1000).astype(np.float32).astype(np.float64)
+    directions = _turned(directions / 1000).astype(np.float16).astype(np.float64)
+    joints = joint_positions(hand) @ REST_TURN.T
+    regressor = joint_regressor(
+        template, directions, joints / 1000, _turned(joint_directions / 1000)
+    )
     order = ("thumb", "index", "middle", "ring", "pinky")
     tips = [np.linalg.norm(vertices - hand[name].joints[3], axis=1).argmin() for name in order]
     return HandAsset(template, directions, None, regressor, weights, faces, np.array(tips))
+
+
+def _turned(directions: np.ndarray) -> np.ndarray:
+    """Turn displacements (N, 3, 10) as the hand rests."""
+    return np.einsum("ab,nbk->nak", REST_TURN, directions)
 
 
 def main() -> None:
@@ -253,7 +270,7 @@ def main() -> None:
         "license": "Apache-2.0",
         "shape_space": "mint",
         "made_by": "python -m mint_hub.synth.make_hand",
-        "units": "metres; fingers along -x, palm facing -y, thumb towards +z; right hand",
+        "units": "metres; MANO's rest: fingers about -x, palm about -y, thumb about +z; right hand",
         "shape_meaning": "; ".join(SHAPE_MEANING),
     }
     parser.parse_args().out.write_bytes(save_hand_asset(make_hand(), metadata))

@@ -28,6 +28,7 @@ from mint_hub.geometry.rotations import rotvec_to_matrix, slerp
 from mint_hub.loaders.schema import Episode, TextSegment
 from mint_hub.synth import sample_scene as scene
 from mint_hub.synth.draw_hand import POSES, pose
+from mint_hub.synth.hand_anatomy import straight_axes
 from mint_hub.synth.sample_render import render
 from mint_hub.synth.sample_scene import Mesh
 
@@ -139,7 +140,7 @@ def _hand_axes(side: Side, fingers: Vector, palm: Vector) -> np.ndarray:
     x /= np.linalg.norm(x)
     y = -np.array(palm) + x * (x @ np.array(palm))
     y /= np.linalg.norm(y)
-    return np.stack([x, y, np.cross(x, y)], -1)
+    return np.stack([x, y, np.cross(x, y)], -1) @ straight_axes(side).T
 
 
 def _pose_of(state: HandState) -> np.ndarray:
@@ -198,7 +199,7 @@ def meshes(episode: Episode, frame: int, model: HandModel) -> list[Mesh]:
     out += [scene.placed(m, T_room_from_mug @ _standing(0.1237, 0.160, 0.3)) for m in scene.mug()]
     for h, side in enumerate(SIDES):
         state = episode.hand_state[frame, h].astype(np.float64)
-        flat = np.asarray(model.vertices(absent(), side))
+        flat = np.asarray(model.vertices(absent(), side)) @ straight_axes(side)
         skin_uv = np.stack([80 + 900 * np.abs(flat[:, 0]), 110 + 900 * flat[:, 2]], -1)
         vertices = transform_points(T_room_from_camera, np.asarray(model.vertices(state, side)))
         out.append(Mesh(scene.SKIN, vertices, model.faces(side), skin_uv))
@@ -213,14 +214,15 @@ def _standing(x: float, y: float, yaw: float) -> np.ndarray:
 def _sleeve(side: Side, T_room_from_wrist: np.ndarray) -> Mesh:
     """Make a sleeve from the wrist, along the hand, to an elbow below the image."""
     sign = 1.0 if side == "right" else -1.0
-    back = T_room_from_wrist[:3, 0] * sign
+    axes = T_room_from_wrist[:3, :3] @ straight_axes(side)
+    back = axes[:, 0] * sign
     start = T_room_from_wrist[:3, 3] + 0.020 * back
     elbow = np.array([sign * 0.30, -0.30, 0.055])
     s = np.array([0, 0, 0.04, 0.10, 0.11, *np.linspace(0.14, 1, 22)])[:, None]
     centers = (1 - s) ** 2 * start + 2 * s * (1 - s) * (start + 0.09 * back) + s * s * elbow
     along = 2 * (1 - s) * 0.09 * back + 2 * s * (elbow - start - 0.09 * back)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    u = np.cross(along, T_room_from_wrist[:3, 2] * sign)
+    u = np.cross(along, axes[:, 2] * sign)
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     v = np.cross(along, u)
     bulge = 0.0018 * np.sin(34 * s + 2 * sign) * np.clip(6 * s, 0, 1) + 0.004 * (s > 0.105)

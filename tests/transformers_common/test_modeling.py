@@ -13,7 +13,7 @@ from torch import nn
 from mint_hub.model.configuration_mint import MintConfig
 from mint_hub.model.modeling_mint import MintModel
 from tests.transformers_common import sdist
-from tests.transformers_common.tiny import tiny_config, tiny_input
+from tests.transformers_common.tiny import tiny_config, tiny_input, tiny_labels
 
 configuration = sdist.load("test_configuration_common")
 common = sdist.load("test_modeling_common")
@@ -52,21 +52,6 @@ def by_default(method: str, **defaults: Any) -> Iterator[None]:
         yield
 
 
-@contextmanager
-def with_a_loss() -> Iterator[None]:
-    """A loss that reaches every output, while labels are not part of this version."""
-    own = MintModel.forward
-
-    def forward(self, *args, **kwargs):
-        output = own(self, *args, **kwargs)
-        outputs = (output.pose_encoding, output.hand_state, output.presence_logits)
-        output.loss = sum(one.float().square().mean() for one in outputs)
-        return output
-
-    with mock.patch.object(MintModel, "forward", forward):
-        yield
-
-
 class MintModelTest(common.ModelTesterMixin, unittest.TestCase):
     all_model_classes = (MintModel,)
     test_resize_embeddings = False  # there is no vocabulary
@@ -81,13 +66,11 @@ class MintModelTest(common.ModelTesterMixin, unittest.TestCase):
     def test_config(self):
         self.config_tester.run_common_tests()
 
-    def test_training(self):
-        with with_a_loss():
-            super().test_training()
-
-    def check_training_gradient_checkpointing(self, gradient_checkpointing_kwargs=None):
-        with with_a_loss():
-            super().check_training_gradient_checkpointing(gradient_checkpointing_kwargs)
+    def _prepare_for_class(self, inputs_dict, model_class, return_labels=False):
+        inputs = super()._prepare_for_class(inputs_dict, model_class)
+        if return_labels:
+            inputs["labels"] = tiny_labels(*inputs["pixel_values"].shape[:2])
+        return inputs
 
     def test_model_get_set_embeddings(self):
         # The mixin expects a vocabulary; ours is the convolution that embeds patches.

@@ -1,0 +1,336 @@
+"""From worlds to episodes: pictures, exact labels, and shards like those of any other source.
+
+A hand counts as present when any of its 21 joints, more than 1 cm before the camera, projects into
+the image; ``presence_score`` is the share of it that nothing hides (``Renderer.visible_fraction``),
+which is what a presence head should learn from. Labels are written ``lossless``: they are exact.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Collection, Generator, Iterator
+from dataclasses import asdict, dataclass, field
+from os import PathLike
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mint_hub.conventions import MODEL_FPS
+from mint_hub.geometry.camera import fov_vh_to_K, project
+from mint_hub.geometry.hand_model import HandModel
+from mint_hub.geometry.hand_state import absent
+from mint_hub.loaders.parallel import in_order
+from mint_hub.loaders.schema import Episode
+from mint_hub.loaders.shards import CorpusReport, write_corpus
+from mint_hub.synth.corruption import Corruption, corrupt, encode
+from mint_hub.synth.figure import LEFT_HAND, RIGHT_HAND
+from mint_hub.synth.presets import GENERATOR, preset_named, seed_of
+from mint_hub.synth.render import Rendered, Renderer
+from mint_hub.synth.scene import make_world
+from mint_hub.synth.world import World
+
+__all__ = [
+    "DEPTH_STEP_M",
+    "Clip",
+    "draw_corruption",
+    "make_clip",
+    "make_episode",
+    "presence_of",
+    "synthesise",
+]
+
+MP4: Final = "mp4"
+DEPTH: Final = "depth.npz"
+SEGMENTATION: Final = "segmentation.npz"
+
+DEPTH_STEP_M: Final = 2.0**-12
+"""Depth is stored as uint16 multiples of this, a quarter of a millimetre; 0 where there is none."""
+
+_CAMERA_STREAM: Final = 7
+_LEAST_Z_M: Final = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """An episode with its pictures.
+
+    Attributes:
+        episode: the labels.
+        members: ``mp4``, and where asked ``depth.npz`` ("depth" (T, H, W) uint16) and
+            ``segmentation.npz`` ("segmentation" (T, H, W) uint8, see ``render.Rendered``).
+
+    """
+
+    episode: Episode
+    members: dict[str, bytes]
+
+
+def presence_of(world: World) -> NDArray[np.bool_]:
+    """Whether any joint of a hand that exists, with z > 0.01 m, is inside the image: (T, 2)."""
+    joints = np.asarray(HandModel.template().keypoints(world.hands.hand_state.astype(float)))
+    K = np.asarray(fov_vh_to_K(np.asarray(world.fov_vh_rad), world.image_size_hw))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        uv, z = project(joints, K)
+    height, width = world.image_size_hw
+    inside = (uv >= 0).all(-1) & (uv[..., 0] < width) & (uv[..., 1] < height) & (z > _LEAST_Z_M)
+    return inside.any(-1) & world.hands.exists
+
+
+def draw_corruption(world: World) -> Corruption:
+    """The camera that takes a world's pictures: how bad it is, drawn from the world's seed."""
+    stream = preset_named(world.preset).stream
+    rng = np.random.default_rng([GENERATOR, stream, world.seed, _CAMERA_STREAM])
+    return Corruption(
+        shutter=round(float(rng.uniform(0, 0.45) * (rng.random() < 0.7)), 3),
+        exposure_drift=round(float(rng.uniform(0, 0.12)), 3),
+        white_drift=round(float(rng.uniform(0, 0.06)), 3),
+        vignette=round(float(rng.uniform(0, 0.3)), 3),
+        blur_px=round(float(rng.uniform(0, 0.7)), 3),
+        shot_noise=round(float(rng.uniform(0, 0.02)), 4),
+        read_noise=round(float(rng.uniform(0, 0.006)), 4),
+        crf=int(rng.integers(18, 27)),
+    )
+
+
+def make_episode(
+    world: World,
+    renderer: Renderer,
+    *,
+    depth: bool = False,
+    segmentation: bool = False,
+    corruption: Corruption | None = None,
+) -> Clip:
+    """Draw a world.
+
+    Args:
+        world: what to draw; its lens must be none.
+        renderer: open, of the world's image size.
+        depth: also keep depth.
+        segmentation: also keep segments.
+        corruption: of the pictures; drawn from the world's seed without it.
+
+    Raises:
+        ValueError: a world with a lens: presence is that of a pinhole.
+
+    """
+    if world.lens is not None:
+        raise ValueError("world, lens: expected none (labels are a pinhole's), got one")
+    settings = draw_corruption(world) if corruption is None else corruption
+    passes = {"rgb", "segmentation"}
+    passes |= {"flow"} if settings.shutter > 0 else set()
+    passes |= {"depth"} if depth else set()
+    kept = _Kept(renderer, world, depth, segmentation)
+    frames = kept.watch(renderer.frames(world, passes))  # pyright: ignore[reportArgumentType]
+    members = {MP4: encode(corrupt(frames, settings, world.seed), settings, world.fps)}
+    if depth:
+        members[DEPTH] = _npz("depth", np.stack(kept.depths))
+    if segmentation:
+        members[SEGMENTATION] = _npz("segmentation", np.stack(kept.segments))
+    return Clip(_labels(world, np.stack(kept.visible), settings), members)
+
+
+@dataclass(eq=False)
+class _Kept:
+    """What is measured of the frames while they go by to the encoder."""
+
+    renderer: Renderer
+    world: World
+    depth: bool
+    segmentation: bool
+    visible: list[NDArray[np.float32]] = field(default_factory=list[NDArray[np.float32]])
+    depths: list[NDArray[np.uint16]] = field(default_factory=list[NDArray[np.uint16]])
+    segments: list[NDArray[np.uint8]] = field(default_factory=list[NDArray[np.uint8]])
+
+    def watch(self, frames: Iterator[Rendered]) -> Iterator[Rendered]:
+        for frame in frames:
+            assert frame.segmentation is not None
+            self.visible.append(self._visible(frame.index, frame.segmentation))
+            if self.depth:
+                assert frame.depth is not None
+                steps = np.clip(np.round(frame.depth / DEPTH_STEP_M), 0, 65535)
+                self.depths.append(steps.astype(np.uint16))
+            if self.segmentation:
+                self.segments.append(frame.segmentation)
+            yield frame
+
+    def _visible(self, k: int, segments: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """As ``Renderer.visible_fraction``, from segments that are drawn already."""
+        alone = self.renderer.hand_masks(self.world, k, dressed=True).sum((1, 2))
+        seen = np.bincount(segments.ravel(), minlength=6)[[LEFT_HAND, RIGHT_HAND]]
+        return (seen / np.maximum(alone, 1)).astype(np.float32)
+
+
+def _labels(world: World, visible: NDArray[np.float32], settings: Corruption) -> Episode:
+    presence = presence_of(world)
+    state = np.where(presence[..., None], world.hands.hand_state, absent(presence.shape))
+    size_hw = world.image_size_hw
+    return Episode(
+        key=world.key,
+        timestamps_s=np.arange(world.num_frames) / world.fps,
+        T_camera_from_world=world.T_camera_from_world,
+        fov_vh_rad=np.tile(np.asarray(world.fov_vh_rad), (world.num_frames, 1)),
+        hand_state=state.astype(np.float32),
+        presence=presence,
+        presence_score=np.clip(visible, 0.0, 1.0),
+        image_size_hw=size_hw,
+        text=world.text,
+        meta={
+            "source": f"mint-hub synth {world.preset}",
+            "uid": world.key,
+            "domain": "tabletop",
+            "shape_space": "mint",
+            "hand_model": HandModel.template().name,
+            "scale_status": "exact (synthetic)",
+            "fps": MODEL_FPS,
+            "conventions": "world: z up, metres; presence_score: visible share of the hand",
+            "synth": {
+                "preset": world.preset,
+                "seed": world.seed,
+                "camera": asdict(settings),
+                **world.meta,
+            },
+        },
+    )
+
+
+def _npz(name: str, array: NDArray[Any]) -> bytes:
+    """A compressed npz whose bytes depend on nothing but the array."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=4) as file:
+        plain = io.BytesIO()
+        np.lib.format.write_array(plain, array, allow_pickle=False)
+        entry = zipfile.ZipInfo(f"{name}.npy")
+        file.writestr(entry, plain.getvalue(), zipfile.ZIP_DEFLATED, 4)
+    return buffer.getvalue()
+
+
+# --------------------------------------------------------------------------------- shards
+
+
+def make_clip(
+    seed: int,
+    preset: str = "train",
+    num_frames: int | None = None,
+    *,
+    depth: bool = False,
+    segmentation: bool = False,
+) -> Clip:
+    """Make a world and draw it, with a renderer of its own; see ``scene.make_world``.
+
+    Raises:
+        ImportError: moderngl is not installed.
+        RuntimeError: EGL is missing. Both say what to install.
+        ValueError: as ``make_world`` does.
+
+    """
+    world = make_world(seed, preset, num_frames)
+    with Renderer(world.image_size_hw) as renderer:
+        return make_episode(world, renderer, depth=depth, segmentation=segmentation)
+
+
+def synthesise(
+    folder: str | PathLike[str],
+    preset: str = "train",
+    episodes: int | None = None,
+    seed: int = 0,
+    *,
+    config: str | None = None,
+    split: str | None = None,
+    num_frames: int | None = None,
+    depth: bool = False,
+    segmentation: bool = False,
+    num_procs: int = 1,
+    progress: bool = False,
+) -> CorpusReport:
+    """Write a split of synthetic clips, ``folder/config/split``; called again, it goes on.
+
+    Args:
+        folder: of the corpus.
+        preset: "train", "bench" or "bench-ood".
+        episodes: how many; by default all of a bench, and it must be said for train.
+        seed: of the run; a bench's clips are the same for every seed.
+        config: name of the config; ``synth-<preset>`` without it.
+        split: "train" for train, "validation" for the benches without it.
+        num_frames: of every clip; drawn per clip without it.
+        depth: also store depth.
+        segmentation: also store segments.
+        num_procs: processes that make clips.
+        progress: show a bar.
+
+    Raises:
+        ImportError, RuntimeError: as ``make_clip`` does.
+        CorpusError: as ``write_corpus`` does.
+        ValueError: an unknown preset, or a number of episodes that it does not have.
+
+    """
+    kind = preset_named(preset)
+    count = kind.clips if episodes is None else episodes
+    if count is None or count < 1:
+        raise ValueError(f"episodes: expected at least 1 for {preset}, got {episodes}")
+    seeds = [seed_of(preset, seed, n) for n in range(count)]
+    maker = _Maker(preset, num_frames, depth, segmentation)
+    clips = _Clips(maker, seeds, num_procs)
+    try:
+        return write_corpus(
+            clips,
+            folder,
+            config or f"synth-{preset}",
+            split or ("train" if kind.clips is None else "validation"),
+            format="lossless",
+            extra=True,
+            seed=None,
+            progress=progress,
+            extra_members=clips.members_of,
+        )
+    finally:
+        clips.close()
+
+
+@dataclass(frozen=True)
+class _Maker:
+    """Makes the clip of a seed; travels to other processes."""
+
+    preset: str
+    num_frames: int | None
+    depth: bool
+    segmentation: bool
+
+    def __call__(self, seed: int) -> Clip:
+        return make_clip(
+            seed, self.preset, self.num_frames, depth=self.depth, segmentation=self.segmentation
+        )
+
+
+class _Clips:
+    """Clips by number, made ahead by other processes once they are asked for in a row."""
+
+    def __init__(self, maker: _Maker, seeds: Collection[int], num_procs: int) -> None:
+        self._maker, self._seeds, self._num_procs = maker, list(seeds), num_procs
+        self._stream: Generator[Clip] | None = None
+        self._next, self._stop = -1, 0
+        self._members: dict[str, dict[str, bytes]] = {}
+
+    def __len__(self) -> int:
+        return len(self._seeds)
+
+    def __getitem__(self, i: int, /) -> Episode:
+        if self._stream is None or i != self._next or i >= self._stop:
+            in_a_row = i in (0, self._next)
+            self.close()
+            self._stop = len(self._seeds) if in_a_row else i + 1
+            seeds = self._seeds[i : self._stop]
+            self._stream = in_order(self._maker, seeds, self._num_procs, 1, start="spawn")
+        clip = next(self._stream)
+        self._next = i + 1
+        self._members = {clip.episode.key: clip.members}
+        return clip.episode
+
+    def members_of(self, episode: Episode) -> dict[str, bytes]:
+        return self._members[episode.key]
+
+    def close(self) -> None:
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None

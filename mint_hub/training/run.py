@@ -1,0 +1,368 @@
+"""A run of training from a request: data, network, trainer; made again, it goes on.
+
+    report = train(Request(recipe=recipe_named("stage1"), data=("corpus",), out="run", pace=...))
+
+``run.json`` in the run's folder says what the run is. The same request goes on from the newest
+checkpoint; another one is refused. At the end the network lies in ``model``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from transformers.trainer_utils import set_seed
+
+from mint_hub._version import __version__
+from mint_hub.loaders.atomic import replacing
+from mint_hub.loaders.resolvers import Videos
+from mint_hub.model.configuration_mint import MintConfig
+from mint_hub.model.modeling_mint import MintModel
+from mint_hub.model.processing_mint import MintProcessor
+from mint_hub.synth.teacher_noise import TeacherNoise
+from mint_hub.training.augment import Augmentation, ColourAugmentation
+from mint_hub.training.clips import DataError, find_splits
+from mint_hub.training.data import PositionDataset, TrainingWindows, WindowSettings, open_windows
+from mint_hub.training.recipes import Recipe
+from mint_hub.training.trainer import (
+    LOG,
+    STAGING,
+    MintTrainer,
+    Pace,
+    last_checkpoint,
+    training_arguments,
+)
+
+__all__ = ["MODEL", "RUN", "Report", "Request", "train"]
+
+RUN: Final = "run.json"
+MODEL: Final = "model"
+SURVEYS: Final = "surveys"
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to train.
+
+    Attributes:
+        recipe: of this stage.
+        data: corpus folders, their configs, or splits.
+        out: folder of the run.
+        pace: length of the run, and how often what is written.
+        init: "random"; a LingBot-Map checkpoint (.pt); or a folder or repository of a MINT model.
+        config: sizes of the network; needed with "random" and .pt, checked with a model.
+        validation: corpus folders to score on during training; None: the validation splits of
+            ``data``, where the pace asks for scores.
+        mixture: weights of sources by name; None: each window alike.
+        cap_per_stratum: most windows of a (source, domain, participant).
+        noise: corrupt the training labels as a cascade would, see `synth.teacher_noise`.
+        videos: where videos of unpacked corpora are.
+        allow_evaluation_clips: train on clips that are kept for evaluation.
+        augment: colours; None: as the recipe says.
+        command: what was typed, for the record.
+        cpu: train on the CPU even where there is a GPU.
+        progress: show a bar.
+        fsdp: shard the network's layers over processes (FSDP2) instead of copying it to each.
+
+    """
+
+    recipe: Recipe
+    data: Sequence[str | Path]
+    out: str | Path
+    pace: Pace
+    init: str = "random"
+    config: MintConfig | None = None
+    validation: Sequence[str | Path] | None = None
+    mixture: Mapping[str, float] | None = None
+    cap_per_stratum: int | None = None
+    noise: TeacherNoise | None = None
+    videos: Videos | None = None
+    allow_evaluation_clips: bool = False
+    augment: Augmentation | None = None
+    command: str = ""
+    cpu: bool = False
+    progress: bool = False
+    fsdp: bool = False
+
+
+@dataclass(frozen=True)
+class Report:
+    """What became of a run.
+
+    Attributes:
+        model: folder of the trained network.
+        steps: done in all.
+        resumed_from: step of the checkpoint that it went on from; 0: from the beginning.
+        log: the lines of the log.
+        warnings: what was left out of the data, in words.
+
+    """
+
+    model: Path
+    steps: int
+    resumed_from: int
+    log: list[dict[str, Any]]
+    warnings: tuple[str, ...]
+
+
+def train(request: Request) -> Report:
+    """Train, or go on training.
+
+    Raises:
+        DataError: nothing that may be trained on; see `data.open_windows`.
+        ValueError: a request that contradicts itself, its recipe, or the run that lies there; a
+            checkpoint of another size.
+        OSError: a checkpoint that cannot be written; nothing is left half-written.
+        RuntimeError: a loss that is not finite.
+
+    """
+    out = Path(request.out).absolute()
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out}: expected a folder for the run, found a file")
+    _check(request)
+    world = int(os.environ.get("WORLD_SIZE", "1"))
+    checkpoint = last_checkpoint(out)
+    # Before the model: it makes the process group, so that ranks agree on devices and seeds.
+    arguments = training_arguments(
+        out,
+        request.recipe,
+        request.pace,
+        world_size=world,
+        cpu=request.cpu,
+        progress=request.progress,
+        **({"fsdp": True, "fsdp_config": {"version": 2}} if request.fsdp else {}),
+    )
+    config = _config(request, checkpoint)
+    windows = _windows(request, config, out)
+    _check_windows(request, config, windows)
+    facts = _facts(request, config, windows)
+    with arguments.main_process_first(desc="run.json"):
+        _same_run(out, facts)
+        if arguments.process_index == 0:
+            shutil.rmtree(out / STAGING, ignore_errors=True)
+    done = out / MODEL
+    if done.is_dir() and checkpoint is not None and _step(checkpoint) >= request.pace.steps:
+        return Report(done, _step(checkpoint), _step(checkpoint), _log(out), windows.warnings)
+    set_seed(request.recipe.optimisation.seed)
+    model = MintModel(config) if checkpoint is not None else _model(request, config)
+    trainer = MintTrainer(
+        model,
+        request.recipe,
+        request.pace,
+        arguments,
+        PositionDataset(windows, request.pace.steps * request.recipe.batch, _augmentation(request)),
+        _validation(request, windows, out),
+        _Card(request, facts),
+    )
+    trainer.train(resume_from_checkpoint=None if checkpoint is None else str(checkpoint))
+    if request.pace.steps % request.pace.save_every:
+        trainer.save_now()
+    trainer.save_folder(done)
+    return Report(
+        done,
+        trainer.state.global_step,
+        0 if checkpoint is None else _step(checkpoint),
+        list(trainer.state.log_history),
+        windows.warnings,
+    )
+
+
+# --- parts ----------------------------------------------------------------------------------------
+
+
+def _check(request: Request) -> None:
+    recipe, random = request.recipe, request.init == "random"
+    if recipe.stage == 2 and (random or request.init.endswith(".pt")):
+        raise ValueError(
+            f"recipe {recipe.name}: stage 2 trains the camera head of a stage 1 network: expected "
+            f"its folder or repository as --init, got {request.init!r}"
+        )
+    if recipe.init == "random" and not random:
+        raise ValueError(f"recipe {recipe.name}: expected --init random, got {request.init!r}")
+    if recipe.init == "pretrained" and random:
+        raise ValueError(f"recipe {recipe.name}: expected a checkpoint as --init, got random")
+    if recipe.optimisation.warmup_steps >= request.pace.steps:
+        raise ValueError(
+            f"steps: expected more than the {recipe.optimisation.warmup_steps} steps of warm-up, "
+            f"got {request.pace.steps}"
+        )
+
+
+def _config(request: Request, checkpoint: Path | None) -> MintConfig:
+    """Sizes of the network, without its weights."""
+    if checkpoint is not None:
+        return MintConfig.from_pretrained(checkpoint)
+    if request.init == "random" or request.init.endswith(".pt"):
+        if request.init != "random" and not Path(request.init).is_file():
+            raise ValueError(f"--init {request.init}: no such file")
+        return request.config or MintConfig.full()
+    if request.init.startswith((".", "/", "~")) and not Path(request.init).is_dir():
+        raise ValueError(f"--init {request.init}: no such folder")
+    if request.config is not None:
+        return request.config
+    folder = Path(request.init)
+    if folder.is_dir() and not (folder / "config.json").is_file():
+        return MintConfig.full()  # of the public release; from_pretrained checks its shapes
+    return MintConfig.from_pretrained(request.init)
+
+
+def _model(request: Request, config: MintConfig) -> MintModel:
+    if request.init == "random":
+        return MintModel(config)
+    if request.init.endswith(".pt"):
+        return MintModel.from_lingbot_map(request.init, config)
+    return MintModel.from_pretrained(request.init, config=config, dtype=torch.float32)
+
+
+def _settings(request: Request) -> WindowSettings:
+    recipe = request.recipe
+    return WindowSettings(
+        length=recipe.window,
+        stride=recipe.stride,
+        presence=recipe.presence,
+        cap_per_stratum=request.cap_per_stratum,
+        mixture=request.mixture,
+        seed=recipe.optimisation.seed,
+        videos=request.videos,
+        allow_evaluation_clips=request.allow_evaluation_clips,
+    )
+
+
+def _windows(request: Request, config: MintConfig, out: Path) -> TrainingWindows:
+    splits = find_splits(request.data, "train", request.noise, request.recipe.optimisation.seed)
+    processor = MintProcessor.for_config(config)
+    windows = open_windows(splits, _settings(request), processor, out / SURVEYS)
+    windows.order()  # a mixture that names no source of these is refused now
+    return windows
+
+
+def _check_windows(request: Request, config: MintConfig, windows: TrainingWindows) -> None:
+    if request.recipe.sources == "one" and len(windows.sources) > 1:
+        raise DataError(
+            f"recipe {request.recipe.name}: expected data of one source, got "
+            f"{', '.join(windows.sources)}"
+        )
+    others = [space for space in windows.shape_spaces if space not in ("", config.shape_space)]
+    if others and "hand_head" in request.recipe.trained:
+        raise DataError(
+            f"shape numbers: expected those of the network's space, {config.shape_space!r}, got "
+            f"{others[0]!r}; make the network with that shape_space, or train on other data"
+        )
+
+
+def _augmentation(request: Request) -> Augmentation | None:
+    if request.augment is not None:
+        return request.augment
+    return ColourAugmentation() if request.recipe.augment else None
+
+
+def _validation(request: Request, windows: TrainingWindows, out: Path) -> TrainingWindows | None:
+    """Windows to score on, with exact labels, in the training's scales; clips of benches may be."""
+    if request.pace.evaluate_every is None:
+        return None
+    settings = WindowSettings(
+        length=request.recipe.window,
+        stride=request.recipe.window,
+        presence=request.recipe.presence,
+        videos=request.videos,
+        allow_evaluation_clips=True,
+    )
+    splits = find_splits(request.validation or request.data, "validation")
+    return open_windows(splits, settings, windows.processor, out / SURVEYS, windows.scales)
+
+
+# --- the record -----------------------------------------------------------------------------------
+
+
+def _facts(request: Request, config: MintConfig, windows: TrainingWindows) -> dict[str, Any]:
+    """What makes a run the same run, ready for JSON."""
+    recipe = request.recipe
+    sizes = {k: v for k, v in config.to_dict().items() if k in MintConfig.__annotations__}
+    facts = {
+        "recipe": recipe.name,
+        "stage": recipe.stage,
+        "loss": dict(recipe.loss.weights),
+        "observability": recipe.loss.observability,
+        "learning_rates": dict(recipe.learning_rates),
+        "batch": recipe.batch,
+        "window": recipe.window,
+        "stride": recipe.stride,
+        "presence": recipe.presence,
+        "optimisation": asdict(recipe.optimisation),
+        "steps": request.pace.steps,
+        "init": request.init,
+        "config": sizes,
+        "data": windows.content,
+        "sources": dict(zip(windows.sources, windows.sizes, strict=True)),
+        "mixture": None if request.mixture is None else dict(request.mixture),
+        "augmentation": repr(_augmentation(request)),
+        "noise": None if request.noise is None else asdict(request.noise),
+    }
+    return json.loads(json.dumps(facts))
+
+
+def _same_run(out: Path, facts: dict[str, Any]) -> None:
+    """Write the record of a new run; refuse another run's folder."""
+    path = out / RUN
+    if not path.is_file():
+        if last_checkpoint(out) is not None:
+            raise ValueError(f"{out}: has checkpoints but no {RUN}: choose another folder")
+        with replacing(path) as temporary:
+            temporary.write_text(json.dumps(facts, indent=1) + "\n")
+        return
+    try:
+        before = json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path}: damaged: {error}") from error
+    for name, value in facts.items():
+        if before.get(name) != value:
+            raise ValueError(
+                f"{out}: another run lies here: {name} was {before.get(name)!r}, now {value!r}. "
+                "Choose another folder, or the same options to go on"
+            )
+
+
+def _step(checkpoint: Path) -> int:
+    return int(checkpoint.name.rsplit("-", 1)[1])
+
+
+def _log(out: Path) -> list[dict[str, Any]]:
+    path = out / LOG
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+
+
+@dataclass(frozen=True)
+class _Card:
+    """README.md of a checkpoint."""
+
+    request: Request
+    facts: Mapping[str, Any]
+
+    def __call__(self, now: Mapping[str, Any]) -> str:
+        facts = self.facts
+        sources = ", ".join(f"{name or 'unnamed'} ({n})" for name, n in facts["sources"].items())
+        synthetic = all("mint-hub synth" in name for name in facts["sources"])
+        first = (
+            "Trained on synthetic clips only, for trying the API, not for labelling."
+            if synthetic
+            else "A checkpoint of a training run; evaluate it before use."
+        )
+        rows = {
+            "recipe": facts["recipe"],
+            "begun with": facts["init"] if facts["init"] == "random" else "a checkpoint",
+            "steps": f"{now['steps']} of {facts['steps']}",
+            "frames seen": f"{now['frames']:,}",
+            "windows": f"{sources}, data hash {facts['data']}",
+            "seed": facts["optimisation"]["seed"],
+            "mint-hub": __version__,
+            "command": f"`{self.request.command}`" if self.request.command else "the Python API",
+        }
+        table = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
+        head = "---\nlibrary_name: transformers\ntags:\n- mint\n- egocentric\n- hands\n---\n"
+        return f"{head}\n{first}\n\n| | |\n| --- | --- |\n{table}\n"
