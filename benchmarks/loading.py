@@ -15,7 +15,8 @@ three slow enough to be stopped after ``--seconds``:
     webdataset    the same shards; windows: one of each streamed sample, as it has no random access
     datasets      the same shards with declared features, map-style and streaming (windows likewise)
     lerobot       the same numbers as LeRobot v3 parquet, a row a frame, asked for as lerobot 0.4
-                  does: key by key, by a list of rows
+                  does: key by key, by a list of rows; with the version of `datasets` tried, each
+                  key then costs its whole column, so the next one is the fair comparison
     parquet rows  the same files read as they are fastest there: one slice of rows, then its keys
 """
 
