@@ -76,6 +76,16 @@ def require_finite(name: str, value: Array) -> None:
         )
 
 
+def runs(mask: "NDArray[np.bool_]") -> list[tuple[int, int]]:
+    """Stretches (start, stop) in which a mask (N,) is true, in order.
+
+    >>> runs(np.array([True, True, False, True]))
+    [(0, 2), (3, 4)]
+    """
+    edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
+    return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
+
+
 def detached(x: ArrayT) -> ArrayT:
     """``x`` without its gradient history; numpy arrays are returned as they are."""
     values: Any = x

@@ -26,6 +26,7 @@ from mint_hub.geometry.additive_metrics import (
     finite_where,
     ratio,
 )
+from mint_hub.geometry.arrays import runs
 from mint_hub.geometry.rigid import rigid, transform_points, umeyama
 from mint_hub.geometry.trajectory_metrics import DEGENERATE_PATH_M, align_paths
 
@@ -127,7 +128,7 @@ def world_hand_statistics(
     total = WorldStatistics(frames=int(both.sum()), true_frames=int(true_present.sum()))
     for hand in (0, 1):
         pair = world[:, hand], true_world[:, hand]
-        starts, stops = _runs(both[:, hand])
+        starts, stops = np.array(runs(both[:, hand]), np.intp).reshape(-1, 2).T
         total += _chunk_sums(*pair, starts, stops) + _path_sums(*pair, starts, stops)
         total += _acceleration_sums(*pair, both[:, hand], fps)
     return total
@@ -138,12 +139,6 @@ def _checked_joints(name: str, hands: WorldHands, frames: int) -> tuple[Floats, 
     field = f"{name}.joints_camera"
     joints = checked_floats(field, hands.joints_camera, (frames, 2, 21, 3))
     return finite_where(field, joints, present), present
-
-
-def _runs(mask: Bools) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Starts and stops of the runs of True in (T,)."""
-    edges = np.diff(np.concatenate([[0], mask.astype(np.int8), [0]]))
-    return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
 
 
 def _equally_long(starts: NDArray[np.intp], stops: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:

@@ -25,6 +25,7 @@ from mint_hub.loaders.beside import ACCOUNT, LABELLING
 from mint_hub.loaders.card import write_card
 from mint_hub.loaders.changelog import Changelog
 from mint_hub.loaders.integrity import verify
+from mint_hub.loaders.manifest import read_manifest
 from mint_hub.loaders.participants import group_of
 from mint_hub.loaders.schema import Episode
 from mint_hub.loaders.shards import CorpusReport, split_of, write_corpus
@@ -351,7 +352,7 @@ def _write_shards(
                 _Files(paths), out, config, split, extra=True, progress=progress
             )
         report.num_episodes += len(paths)
-        report.num_frames += sum(Episode.load(path).num_frames for path in paths)
+        report.num_frames += read_manifest(final).num_frames
     if any(by_split.values()):
         write_card(out)
         checked = verify(out, "full")

@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mint_hub.geometry import arrays
+
 Image = NDArray[np.uint8]
 Point = Sequence[float] | NDArray[np.floating]
 Color = tuple[int, int, int]
@@ -190,8 +192,7 @@ def runs(mask: NDArray[np.bool_]) -> list[slice]:
     >>> runs(np.array([True, True, False, True]))
     [slice(0, 2, None), slice(3, 4, None)]
     """
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return [slice(start, stop) for start, stop in arrays.runs(mask)]
 
 
 def plural(count: int, noun: str) -> str:

@@ -11,6 +11,7 @@ from typing import Any, Final, Literal, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from mint_hub.geometry.arrays import runs
 from mint_hub.labelling.records import Clip, Lost, StageReport, Video
 from mint_hub.labelling.stage import (
     LOCAL,
@@ -22,7 +23,6 @@ from mint_hub.labelling.stage import (
     reported,
 )
 from mint_hub.labelling.stages.annotations import FORMATS, POINT_S, Described, Who, described
-from mint_hub.labelling.stages.timeline import runs
 from mint_hub.loaders.clips import clip_size
 from mint_hub.loaders.fields import TextSegment
 from mint_hub.loaders.video_reader import VideoReader

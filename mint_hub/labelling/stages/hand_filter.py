@@ -11,9 +11,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mint_hub.geometry.arrays import runs
 from mint_hub.labelling.records import Clip, Lost, Video
 from mint_hub.labelling.stage import Resources, report_of, require
-from mint_hub.labelling.stages.timeline import place, runs, source_times
+from mint_hub.labelling.stages.timeline import place, source_times
 
 CROWDED: Final = "more than two hands"
 NO_HAND: Final = "no hand for more than {:g} s"

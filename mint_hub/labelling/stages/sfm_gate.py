@@ -11,6 +11,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mint_hub.geometry.arrays import runs
+
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
@@ -73,22 +75,16 @@ def segments(
     solved frames and have at least ``min_frames``.
     """
     usable = np.ones(len(covisible), dtype=bool)
-    for start, stop in _runs(~solved):
+    for start, stop in runs(~solved):
         if stop - start > max_unsolved:
             usable[start:stop] = False
     linked = (covisible[:-1] >= min_shared) & usable[:-1] & usable[1:]
     kept: list[tuple[int, int]] = []
-    for start, last in _runs(linked):
+    for start, last in runs(linked):
         frames = start + np.flatnonzero(solved[start : last + 1])
         if len(frames) and frames[-1] + 1 - frames[0] >= min_frames:
             kept.append((int(frames[0]), int(frames[-1]) + 1))
     return kept
-
-
-def _runs(flags: Bool) -> list[tuple[int, int]]:
-    """Stretches (start, stop) of true flags."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]])))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def gaps(kept: Sequence[tuple[int, int]], num_frames: int) -> list[tuple[int, int]]:

@@ -4,8 +4,10 @@ Frame n of the time line is shown at ``start_s + n / fps``. A clip's source time
 stored frames nearest to its places, so each may be half a stored frame off; a clip as a whole is
 not.
 
->>> runs(np.array([True, True, False, True]))
-[(0, 2), (3, 4)]
+>>> from pathlib import Path
+>>> clip = Clip("a", Path("a.mp4"), 0, (384, 384), 30.0, np.arange(3, 6) / 30)
+>>> place(clip, start_s=0.0)
+3
 """
 
 from collections.abc import Sequence
@@ -20,12 +22,6 @@ def place(clip: Clip, start_s: float) -> int:
     """Frame of the time line, which begins at ``start_s``, that is the clip's first."""
     own = np.arange(clip.num_frames)
     return round(float(np.median((clip.source_timestamps_s - start_s) * clip.fps - own)))
-
-
-def runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Stretches (start, stop) in which a mask (N,) is true, in order."""
-    edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
-    return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
 
 
 def source_times(
