@@ -24,6 +24,7 @@ def add_synth(commands: Any) -> None:
     add("--config", help="name of the config (default: synth-PRESET)")
     add("--split", choices=("train", "validation"), help="default: train; of benches: validation")
     add("--frames", type=int, help="frames of every clip (default: 150 to 240, drawn)")
+    add("--scale", type=float, default=1.0, help="factor on the size of pictures (default: 1)")
     add("--depth", action="store_true", help="also store depth")
     add("--segmentation", action="store_true", help="also store segments")
     add("--jobs", type=int, default=1, help="processes that make clips (default: 1)")
@@ -47,6 +48,7 @@ def _synth(args: argparse.Namespace) -> int:
         config=args.config,
         split=args.split,
         num_frames=args.frames,
+        scale=args.scale,
         depth=args.depth,
         segmentation=args.segmentation,
         num_procs=args.jobs,

@@ -8,9 +8,11 @@ which is what a presence head should learn from. Labels are written ``lossless``
 from __future__ import annotations
 
 import io
+import multiprocessing
+import os
 import zipfile
 from collections.abc import Collection, Generator, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from os import PathLike
 from typing import Any, Final
 
@@ -214,20 +216,33 @@ def make_clip(
     preset: str = "train",
     num_frames: int | None = None,
     *,
+    scale: float = 1.0,
     depth: bool = False,
     segmentation: bool = False,
 ) -> Clip:
     """Make a world and draw it, with a renderer of its own; see ``scene.make_world``.
 
+    With ``scale`` the same clip has smaller or larger pictures: its size times that.
+
     Raises:
         ImportError: moderngl is not installed.
         RuntimeError: EGL is missing. Both say what to install.
-        ValueError: as ``make_world`` does.
+        ValueError: as ``make_world`` does; a scale out of 0.1 to 4.
 
     """
-    world = make_world(seed, preset, num_frames)
+    world = _scaled(make_world(seed, preset, num_frames), scale)
     with Renderer(world.image_size_hw) as renderer:
         return make_episode(world, renderer, depth=depth, segmentation=segmentation)
+
+
+def _scaled(world: World, scale: float) -> World:
+    """Change the size of the pictures, to even numbers of pixels; the field of view stays."""
+    if not 0.1 <= scale <= 4:
+        raise ValueError(f"scale: expected 0.1 to 4, got {scale}")
+    if scale == 1:
+        return world
+    height, width = (2 * max(round(side * scale / 2), 1) for side in world.image_size_hw)
+    return replace(world, image_size_hw=(height, width))
 
 
 def synthesise(
@@ -239,6 +254,7 @@ def synthesise(
     config: str | None = None,
     split: str | None = None,
     num_frames: int | None = None,
+    scale: float = 1.0,
     depth: bool = False,
     segmentation: bool = False,
     num_procs: int = 1,
@@ -254,6 +270,7 @@ def synthesise(
         config: name of the config; ``synth-<preset>`` without it.
         split: "train" for train, "validation" for the benches without it.
         num_frames: of every clip; drawn per clip without it.
+        scale: factor on the size of the pictures, height and width.
         depth: also store depth.
         segmentation: also store segments.
         num_procs: processes that make clips.
@@ -262,7 +279,7 @@ def synthesise(
     Raises:
         ImportError, RuntimeError: as ``make_clip`` does.
         CorpusError: as ``write_corpus`` does.
-        ValueError: an unknown preset, or a number of episodes that it does not have.
+        ValueError: an unknown preset, a number of episodes that it does not have, a bad scale.
 
     """
     kind = preset_named(preset)
@@ -270,7 +287,7 @@ def synthesise(
     if count is None or count < 1:
         raise ValueError(f"episodes: expected at least 1 for {preset}, got {episodes}")
     seeds = [seed_of(preset, seed, n) for n in range(count)]
-    maker = _Maker(preset, num_frames, depth, segmentation)
+    maker = _Maker(preset, num_frames, scale, depth, segmentation)
     clips = _Clips(maker, seeds, num_procs)
     try:
         return write_corpus(
@@ -294,12 +311,21 @@ class _Maker:
 
     preset: str
     num_frames: int | None
+    scale: float
     depth: bool
     segmentation: bool
 
     def __call__(self, seed: int) -> Clip:
+        if multiprocessing.parent_process() is not None:
+            # One of several: Mesa draws on this process's own core, without threads beside it.
+            os.environ.setdefault("LP_NUM_THREADS", "0")
         return make_clip(
-            seed, self.preset, self.num_frames, depth=self.depth, segmentation=self.segmentation
+            seed,
+            self.preset,
+            self.num_frames,
+            scale=self.scale,
+            depth=self.depth,
+            segmentation=self.segmentation,
         )
 
 

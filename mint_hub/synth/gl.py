@@ -76,22 +76,18 @@ class ShadowMap:
 
     def __init__(self, ctx: moderngl.Context, side: int) -> None:
         self.side = side
-        self.half = side // 2
         self._depth: Any = ctx.depth_texture((side, side))
         self.target = ctx.framebuffer([], self._depth)
-        self.moments: Any = ctx.texture((self.half, self.half), 2, dtype="f4")
+        self.moments: Any = ctx.texture((side, side), 2, dtype="f4")
         self.moments.repeat_x = self.moments.repeat_y = False
-        self.moments.write(np.ones((self.half, self.half, 2), np.float32).tobytes())
+        self.moments.write(np.ones((side, side, 2), np.float32).tobytes())
 
     def blur(self, radius: float) -> None:
         """Make ``moments`` of what was drawn, blurred by ``radius`` (a share of the width)."""
         depth = np.frombuffer(self._depth.read(), np.float32).reshape(self.side, self.side)
-        small = cv2.resize(
-            cv2.merge([depth, depth * depth]), (self.half, self.half), interpolation=cv2.INTER_AREA
-        )
-        side = 2 * max(1, round(radius * self.half / 2)) + 1
-        blurred = cv2.blur(cv2.blur(small, (side, side)), (side, side))
-        self.moments.write(blurred)
+        box = (2 * max(1, round(radius * self.side / 2)) + 1,) * 2
+        twice = [cv2.blur(cv2.blur(x, box), box) for x in (depth, depth * depth)]
+        self.moments.write(cv2.merge(twice))
 
 
 class Targets:

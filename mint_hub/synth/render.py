@@ -78,7 +78,7 @@ class Renderer:
         image_size_hw: tuple[int, int],
         *,
         samples: int = 4,
-        shadow_size: int = 1024,
+        shadow_size: int = 512,
         hand_model: HandModel | None = None,
     ) -> None:
         self.image_size_hw = require_image_size(image_size_hw)
