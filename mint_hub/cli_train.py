@@ -20,9 +20,9 @@ def add_train(commands: Any) -> None:
         help="train a network on corpora with pictures",
         description="Train on packed corpora, or on labels beside your videos. RECIPE is stage1, "
         "stage2, paper-stage1 or paper-stage2, then options such as +random, +one-source, +world, "
-        "+no-world, +visible, +augment. Interrupted, the same command goes on from the newest "
-        "checkpoint. Several GPUs: start it with torchrun or accelerate. Clips that benchmarks "
-        "score on are refused. Needs mint-hub[train].",
+        "+no-world, +visible, +augment, +views, +scratch. Interrupted, the same command goes on "
+        "from the newest checkpoint. Several GPUs: start it with torchrun or accelerate. Clips "
+        "that benchmarks score on are refused. Needs mint-hub[train].",
     )
     add = parser.add_argument
     add("--recipe", required=True, help="stage1, stage2, or a name with +options")
@@ -49,6 +49,9 @@ def add_train(commands: Any) -> None:
     add("--save-every", type=int, default=500, help="steps between checkpoints (default: 500)")
     add("--keep", type=int, default=2, help="checkpoints to keep (default: 2)")
     add("--workers", type=int, default=0, help="processes that read ahead (default: 0)")
+    add("--cache", type=Path, help="keep surveys and decoded pictures there, for all runs")
+    add("--attention", choices=("sdpa", "eager"), default="sdpa", help="default: sdpa")
+    add("--compile", action="store_true", help="compile layers (on a CPU: needs a C++ compiler)")
     add("--cpu", action="store_true", help="train on the CPU even where there is a GPU")
     add("--fsdp", action="store_true", help="shard the network over processes (FSDP2)")
     add("--allow-evaluation-clips", action="store_true", help="train on them all the same")
@@ -93,6 +96,9 @@ def _train(args: argparse.Namespace) -> int:
         cpu=args.cpu,
         progress=not args.quiet,
         fsdp=args.fsdp,
+        cache=args.cache,
+        attention=args.attention,
+        compile=args.compile,
     )
     report = train(request)
     if int(os.environ.get("RANK", "0")) > 0:  # the first process says it for all

@@ -20,6 +20,9 @@ from mint_hub.geometry.arrays import (
     require_shape,
 )
 
+MIN_DEPTH_M = 0.01
+"""A point no further than this along z is not on screen; metrics floor predicted depths at it."""
+
 
 def fov_vh_to_K(  # noqa: N802
     fov_vh_rad: ArrayT, image_size_hw: tuple[int, int], check: bool = True
@@ -89,6 +92,17 @@ def project(points_camera: ArrayT, K: ArrayT) -> tuple[ArrayT, ArrayT]:
     v = fy * y / safe + cy
     nan = float("nan")
     return xp.stack([xp.where(front, u, nan), xp.where(front, v, nan)], axis=-1), z
+
+
+def on_screen(uv: Array, depth: Array, image_size_hw: tuple[int, int]) -> Any:
+    """Whether points, pixels (..., 2) and depths (...), are seen: (...) bool.
+
+    More than `MIN_DEPTH_M` before the camera, and inside the image: 0 <= u < W, 0 <= v < H. NaN is
+    not seen.
+    """
+    height, width = image_size_hw
+    u, v = uv[..., 0], uv[..., 1]
+    return (depth > MIN_DEPTH_M) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
 
 
 def unproject(uv: ArrayT, depth: ArrayT, K: ArrayT) -> ArrayT:

@@ -26,14 +26,11 @@ from mint_hub.geometry.additive_metrics import (
     finite_where,
     ratio,
 )
-from mint_hub.geometry.camera import project, require_image_size
+from mint_hub.geometry.camera import MIN_DEPTH_M, on_screen, project, require_image_size
 from mint_hub.geometry.hand_model import HandModel
 from mint_hub.geometry.hand_state import absent, unpack
 from mint_hub.geometry.rigid import umeyama
 from mint_hub.geometry.rotations import geodesic_angle
-
-MIN_DEPTH_M = 0.01
-"""A point no further than this along z is not on screen; predicted depths are floored at it."""
 
 HAND_MEASURES = (
     Measure("FAcc", "", 1.0),
@@ -209,15 +206,15 @@ def hand_statistics(
     )
 
     pixels, _ = project(_in_front(true.joints), K_true)
-    on_screen = true.present[..., None] & _on_screen(true.joints, pixels, size_hw)
-    present = on_screen.any(axis=-1)
+    visible = true.present[..., None] & on_screen(pixels, true.joints[..., 2], size_hw)
+    present = visible.any(axis=-1)
     frame, hand = np.nonzero(present & counted)
     missed = ~guess.present[frame, hand]
     guess_pixels, _ = project(_in_front(guess.joints), K_guess)
     pixel_error = np.linalg.norm(guess_pixels - pixels, axis=-1)[frame, hand]
     diagonal = float(np.hypot(*size_hw))
     capped = np.where(missed[:, None], diagonal, np.minimum(pixel_error, diagonal))
-    seen = on_screen[frame, hand]
+    seen = visible[frame, hand]
     return (
         _presence_counts(guess.present, true.present, present, counted)
         + _jitter_sums(guess, true, guess.present & present, counted)
@@ -253,14 +250,6 @@ def _intrinsics(name: str, K: Any, frames: int) -> Floats:
 def _in_front(joints: Floats) -> Floats:
     """Joints with their depth floored."""
     return np.concatenate([joints[..., :2], np.maximum(joints[..., 2:], MIN_DEPTH_M)], axis=-1)
-
-
-def _on_screen(joints: Floats, pixels: Floats, image_size_hw: tuple[int, int]) -> Bools:
-    """Which points (...) are far enough in front and inside the image."""
-    height, width = image_size_hw
-    u, v = pixels[..., 0], pixels[..., 1]
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    return (joints[..., 2] > MIN_DEPTH_M) & inside
 
 
 def _presence_counts(guess: Bools, valid: Bools, present: Bools, counted: Bools) -> HandStatistics:

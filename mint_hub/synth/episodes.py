@@ -3,6 +3,11 @@
 A hand counts as present when any of its 21 joints, more than 1 cm before the camera, projects into
 the image; ``presence_score`` is the share of it that nothing hides (``Renderer.visible_fraction``),
 which is what a presence head should learn from. Labels are written ``lossless``: they are exact.
+
+A clip filmed through a lens has bent pictures (depth and segments with them), and presence is what
+these show. Its camera is, by the convention of ``Episode``, a pinhole: that of
+``rectification(Lens.from_dict(episode.meta["synth"]["lens"]))``, whose ``apply`` turns the pictures
+into those of the labels.
 """
 
 from __future__ import annotations
@@ -20,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mint_hub.conventions import MODEL_FPS
-from mint_hub.geometry.camera import fov_vh_to_K, project
 from mint_hub.geometry.hand_model import HandModel
 from mint_hub.geometry.hand_state import absent
 from mint_hub.loaders.parallel import in_order
@@ -28,6 +32,14 @@ from mint_hub.loaders.schema import Episode
 from mint_hub.loaders.shards import CorpusReport, write_corpus
 from mint_hub.synth.corruption import Corruption, corrupt, encode
 from mint_hub.synth.figure import LEFT_HAND, RIGHT_HAND
+from mint_hub.synth.lensing import (
+    Bend,
+    draw_lens,
+    in_picture,
+    pinhole_of,
+    require_share,
+    seen_through,
+)
 from mint_hub.synth.presets import GENERATOR, preset_named, seed_of
 from mint_hub.synth.render import Rendered, Renderer
 from mint_hub.synth.scene import make_world
@@ -51,7 +63,6 @@ DEPTH_STEP_M: Final = 2.0**-12
 """Depth is stored as uint16 multiples of this, a quarter of a millimetre; 0 where there is none."""
 
 _CAMERA_STREAM: Final = 7
-_LEAST_Z_M: Final = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,14 +81,9 @@ class Clip:
 
 
 def presence_of(world: World) -> NDArray[np.bool_]:
-    """Whether any joint of a hand that exists, with z > 0.01 m, is inside the image: (T, 2)."""
+    """Whether any joint of a hand that exists, with z > 0.01 m, is inside the picture: (T, 2)."""
     joints = np.asarray(HandModel.template().keypoints(world.hands.hand_state.astype(float)))
-    K = np.asarray(fov_vh_to_K(np.asarray(world.fov_vh_rad), world.image_size_hw))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        uv, z = project(joints, K)
-    height, width = world.image_size_hw
-    inside = (uv >= 0).all(-1) & (uv[..., 0] < width) & (uv[..., 1] < height) & (z > _LEAST_Z_M)
-    return inside.any(-1) & world.hands.exists
+    return in_picture(world, joints).any(-1) & world.hands.exists
 
 
 def draw_corruption(world: World) -> Corruption:
@@ -104,28 +110,27 @@ def make_episode(
     segmentation: bool = False,
     corruption: Corruption | None = None,
 ) -> Clip:
-    """Draw a world.
+    """Draw a world, through its lens if it has one (see ``lensing.seen_through``).
 
     Args:
-        world: what to draw; its lens must be none.
+        world: what to draw.
         renderer: open, of the world's image size.
         depth: also keep depth.
         segmentation: also keep segments.
         corruption: of the pictures; drawn from the world's seed without it.
 
     Raises:
-        ValueError: a world with a lens: presence is that of a pinhole.
+        ValueError: a renderer of another image size, or one that was closed.
 
     """
-    if world.lens is not None:
-        raise ValueError("world, lens: expected none (labels are a pinhole's), got one")
     settings = draw_corruption(world) if corruption is None else corruption
     passes = {"rgb", "segmentation"}
     passes |= {"flow"} if settings.shutter > 0 else set()
     passes |= {"depth"} if depth else set()
     kept = _Kept(renderer, world, depth, segmentation)
-    frames = kept.watch(renderer.frames(world, passes))  # pyright: ignore[reportArgumentType]
-    members = {MP4: encode(corrupt(frames, settings, world.seed), settings, world.fps)}
+    drawn = renderer.frames(world, passes)  # pyright: ignore[reportArgumentType]
+    filmed = corrupt(drawn, settings, world.seed, world.lens, world.fov_vh_rad)
+    members = {MP4: encode(kept.watch(filmed), settings, world.fps)}
     if depth:
         members[DEPTH] = _npz("depth", np.stack(kept.depths))
     if segmentation:
@@ -145,6 +150,9 @@ class _Kept:
     depths: list[NDArray[np.uint16]] = field(default_factory=list[NDArray[np.uint16]])
     segments: list[NDArray[np.uint8]] = field(default_factory=list[NDArray[np.uint8]])
 
+    def __post_init__(self) -> None:
+        self._bend = Bend(self.world)
+
     def watch(self, frames: Iterator[Rendered]) -> Iterator[Rendered]:
         for frame in frames:
             assert frame.segmentation is not None
@@ -159,7 +167,8 @@ class _Kept:
 
     def _visible(self, k: int, segments: NDArray[np.uint8]) -> NDArray[np.float32]:
         """As ``Renderer.visible_fraction``, from segments that are drawn already."""
-        alone = self.renderer.hand_masks(self.world, k, dressed=True).sum((1, 2))
+        masks = self.renderer.hand_masks(self.world, k, dressed=True)
+        alone = self._bend.masks(masks).sum((1, 2))
         seen = np.bincount(segments.ravel(), minlength=6)[[LEFT_HAND, RIGHT_HAND]]
         return (seen / np.maximum(alone, 1)).astype(np.float32)
 
@@ -167,12 +176,13 @@ class _Kept:
 def _labels(world: World, visible: NDArray[np.float32], settings: Corruption) -> Episode:
     presence = presence_of(world)
     state = np.where(presence[..., None], world.hands.hand_state, absent(presence.shape))
-    size_hw = world.image_size_hw
+    fov_vh_rad, size_hw = pinhole_of(world)
+    lens = {} if world.lens is None else {"lens": world.lens.to_dict()}
     return Episode(
         key=world.key,
         timestamps_s=np.arange(world.num_frames) / world.fps,
         T_camera_from_world=world.T_camera_from_world,
-        fov_vh_rad=np.tile(np.asarray(world.fov_vh_rad), (world.num_frames, 1)),
+        fov_vh_rad=np.tile(fov_vh_rad.astype(np.float32), (world.num_frames, 1)),
         hand_state=state.astype(np.float32),
         presence=presence,
         presence_score=np.clip(visible, 0.0, 1.0),
@@ -191,6 +201,7 @@ def _labels(world: World, visible: NDArray[np.float32], settings: Corruption) ->
                 "preset": world.preset,
                 "seed": world.seed,
                 "camera": asdict(settings),
+                **lens,
                 **world.meta,
             },
         },
@@ -217,29 +228,39 @@ def make_clip(
     num_frames: int | None = None,
     *,
     scale: float = 1.0,
+    lens: float = 0.0,
     depth: bool = False,
     segmentation: bool = False,
 ) -> Clip:
     """Make a world and draw it, with a renderer of its own; see ``scene.make_world``.
 
-    With ``scale`` the same clip has smaller or larger pictures: its size times that.
+    With ``scale`` the same clip has smaller or larger pictures: its size times that. With ``lens``
+    that share of all seeds is filmed through a lens (``lensing.draw_lens``); all else stays.
 
     Raises:
         ImportError: moderngl is not installed.
         RuntimeError: EGL is missing. Both say what to install.
-        ValueError: as ``make_world`` does; a scale out of 0.1 to 4.
+        ValueError: as ``make_world`` does; a scale out of 0.1 to 4; a lens share out of 0 to 1, or
+            above 0 for a bench.
 
     """
+    require_share(lens, preset)
     world = _scaled(make_world(seed, preset, num_frames), scale)
+    drawn = draw_lens(world, lens)
+    world = world if drawn is None else seen_through(world, drawn)
     with Renderer(world.image_size_hw) as renderer:
         return make_episode(world, renderer, depth=depth, segmentation=segmentation)
 
 
-def _scaled(world: World, scale: float) -> World:
-    """Change the size of the pictures, to even numbers of pixels; the field of view stays."""
+def _check_scale(scale: float) -> float:
     if not 0.1 <= scale <= 4:
         raise ValueError(f"scale: expected 0.1 to 4, got {scale}")
-    if scale == 1:
+    return scale
+
+
+def _scaled(world: World, scale: float) -> World:
+    """Change the size of the pictures, to even numbers of pixels; the field of view stays."""
+    if _check_scale(scale) == 1:
         return world
     height, width = (2 * max(round(side * scale / 2), 1) for side in world.image_size_hw)
     return replace(world, image_size_hw=(height, width))
@@ -255,6 +276,7 @@ def synthesise(
     split: str | None = None,
     num_frames: int | None = None,
     scale: float = 1.0,
+    lens: float = 0.0,
     depth: bool = False,
     segmentation: bool = False,
     num_procs: int = 1,
@@ -271,6 +293,7 @@ def synthesise(
         split: "train" for train, "validation" for the benches without it.
         num_frames: of every clip; drawn per clip without it.
         scale: factor on the size of the pictures, height and width.
+        lens: share of clips whose pictures are bent by a lens; 0 for benches.
         depth: also store depth.
         segmentation: also store segments.
         num_procs: processes that make clips.
@@ -279,7 +302,8 @@ def synthesise(
     Raises:
         ImportError, RuntimeError: as ``make_clip`` does.
         CorpusError: as ``write_corpus`` does.
-        ValueError: an unknown preset, a number of episodes that it does not have, a bad scale.
+        ValueError: an unknown preset, a number of episodes that it does not have, a bad scale
+            or share of lenses.
 
     """
     kind = preset_named(preset)
@@ -287,7 +311,11 @@ def synthesise(
     if count is None or count < 1:
         raise ValueError(f"episodes: expected at least 1 for {preset}, got {episodes}")
     seeds = [seed_of(preset, seed, n) for n in range(count)]
-    maker = _Maker(preset, num_frames, scale, depth, segmentation)
+    if num_frames is not None and num_frames < 1:
+        raise ValueError(f"num_frames: expected at least 1, got {num_frames}")
+    maker = _Maker(
+        preset, num_frames, _check_scale(scale), require_share(lens, preset), depth, segmentation
+    )
     clips = _Clips(maker, seeds, num_procs)
     try:
         return write_corpus(
@@ -312,6 +340,7 @@ class _Maker:
     preset: str
     num_frames: int | None
     scale: float
+    lens: float
     depth: bool
     segmentation: bool
 
@@ -324,6 +353,7 @@ class _Maker:
             self.preset,
             self.num_frames,
             scale=self.scale,
+            lens=self.lens,
             depth=self.depth,
             segmentation=self.segmentation,
         )

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -26,15 +26,16 @@ from mint_hub.geometry import camera_state
 from mint_hub.loaders.attach import VideoAttachment
 from mint_hub.loaders.derived import VIDEO_MEMBER
 from mint_hub.loaders.order import Order
-from mint_hub.loaders.packing import PackedClip
+from mint_hub.loaders.packing import packed_images
 from mint_hub.loaders.resolvers import Videos
 from mint_hub.loaders.schema import Episode
-from mint_hub.loaders.video_source import VideoError
 from mint_hub.training.augment import Augmentation
 from mint_hub.training.clips import ClipRow, DataError, Split, Survey
 from mint_hub.training.normalisation import CameraScales, CameraSums, reanchored, window_starts
 from mint_hub.training.order import MixtureOrder, group_weights
+from mint_hub.training.pixels import PixelCache, resized
 from mint_hub.training.recipes import Presence
+from mint_hub.training.views import OVERSIZE, ViewAugmentation
 from mint_hub.windows import WINDOW_LENGTH
 
 if TYPE_CHECKING:
@@ -55,6 +56,7 @@ __all__ = [
 
 _CAP_SEED: Final = 7
 _AUGMENT: Final = 0xC0102
+_VIEW: Final = 0x71E3
 
 
 @dataclass(frozen=True)
@@ -138,6 +140,7 @@ class TrainingWindows:
         processor: makes the network's input of pictures.
         shape_spaces: what shape numbers mean, of all episodes with hands.
         warnings: what was left out, in words.
+        caches: pictures that were decoded and resized before, by number of the split.
 
     """
 
@@ -150,6 +153,7 @@ class TrainingWindows:
     processor: MintProcessor = field(repr=False)
     shape_spaces: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    caches: Mapping[int, PixelCache] = field(default_factory=dict[int, PixelCache])
 
     def __len__(self) -> int:
         return len(self.places)
@@ -185,28 +189,79 @@ class TrainingWindows:
             assert self.settings.videos is not None
             video = VideoAttachment(split.reader[i], self.settings.videos)
             return video.window(start, length).images
-        with PackedClip(split.reader.member(i, VIDEO_MEMBER)) as clip:
-            frames = int(split.reader.num_frames[i])
-            if clip.num_frames != frames:
-                place = f"{split.name}, episode {split.reader.key(i)}, {VIDEO_MEMBER}"
-                raise VideoError(f"{place}: expected {frames} frames, got {clip.num_frames}")
-            return clip.images(start, length)
+        return packed_images(split.reader, i, start, length)
+
+    def resized(self, number: int, size_hw: tuple[int, int]) -> NDArray[np.uint8]:
+        """Return the pictures of a window at a size, (T, h, w, 3), kept ones where there are any.
+
+        Raises:
+            VideoError: as `pictures`.
+
+        """
+        at, i, start = (int(n) for n in self.places[number])
+        cache = self.caches.get(at)
+        if cache is not None and cache.size_hw == size_hw:
+            return cache.read(i, start, self.settings.length)
+        return resized(self.pictures(number), self.processor, size_hw)
 
     def example(
-        self, number: int, augment: Augmentation | None = None, position: int = 0
+        self,
+        number: int,
+        augment: Augmentation | None = None,
+        views: ViewAugmentation | None = None,
+        position: int = 0,
     ) -> dict[str, Any]:
         """Return ``pixel_values`` (T, 3, h, w) in [0, 1], and ``labels`` by name.
 
         Augmentation follows from the settings' seed and ``position`` alone.
         """
-        images = self.pictures(number)
+        episode, size_hw = self.labels(number), self.image_size_hw
+        images = self.resized(number, self.read_size_hw(views is not None))
+        if views is not None:
+            view = views(np.random.default_rng([self.settings.seed, _VIEW, position]))
+            images, episode = view.images(images, size_hw), view.episode(episode)
         pixels = self.processor.video_processor.preprocess_frames(images)
         if augment is not None:
             pixels = augment(
                 pixels, np.random.default_rng([self.settings.seed, _AUGMENT, position])
             )
-        labels = labels_of(self.labels(number), self.settings.presence, self.scales)
+        labels = labels_of(episode, self.settings.presence, self.scales)
         return {"pixel_values": pixels, "labels": labels}
+
+    @property
+    def image_size_hw(self) -> tuple[int, int]:
+        """Size of the network's pictures."""
+        size: Any = self.processor.video_processor.size
+        return int(size["height"]), int(size["width"])
+
+    def read_size_hw(self, views: bool) -> tuple[int, int]:
+        """Size at which pictures are read: larger than the network's where views crop them."""
+        height, width = self.image_size_hw
+        return (round(height * OVERSIZE), round(width * OVERSIZE)) if views else (height, width)
+
+    def cached(self, folder: Path, views: bool, progress: bool = False) -> TrainingWindows:
+        """Decode and resize all pictures of packed splits into ``folder``, unless they are there.
+
+        Raises:
+            VideoError: a clip that is damaged, missing, or of another length than its episode.
+            OSError: no room.
+
+        """
+        from tqdm.auto import tqdm
+
+        caches: dict[int, PixelCache] = {}
+        video: Any = self.processor.video_processor
+        for at, split in enumerate(self.splits):
+            if not split.packed:
+                continue
+            size_hw = self.read_size_hw(views)
+            cache = PixelCache(folder, split.folder, size_hw, f"resample {int(video.resample)}")
+            caches[at] = cache
+            if not cache.made():
+                with tqdm(total=len(split.reader), disable=not progress, desc=split.name) as bar:
+                    for done in cache.make(split.reader, self.processor):
+                        bar.update(done - bar.n)
+        return replace(self, caches=caches)
 
 
 class PositionDataset(Base):
@@ -221,8 +276,10 @@ class PositionDataset(Base):
         windows: TrainingWindows,
         positions: int,
         augment: Augmentation | None = None,
+        views: ViewAugmentation | None = None,
     ) -> None:
         self.windows, self.positions, self.augment = windows, positions, augment
+        self.views = views
         self._order = windows.order()
 
     def __len__(self) -> int:
@@ -232,7 +289,7 @@ class PositionDataset(Base):
         if not 0 <= position < self.positions:
             raise IndexError(f"position: expected 0 to {self.positions - 1}, got {position}")
         number = self._order.window(position)
-        return self.windows.example(number, self.augment, position)
+        return self.windows.example(number, self.augment, self.views, position)
 
 
 def collate(examples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

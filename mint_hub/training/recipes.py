@@ -102,6 +102,7 @@ class Recipe:
         init: what the run must begin with: "random", "pretrained", or None for either.
         sources: "one" refuses data of several sources.
         augment: change the colours of windows at random.
+        views: mirror windows and crop them about their middle at random, labels alike.
 
     Raises:
         ValueError: a number out of range, an unknown part, or nothing to train.
@@ -120,6 +121,7 @@ class Recipe:
     init: Init | None = None
     sources: Sources = "all"
     augment: bool = False
+    views: bool = False
 
     def __post_init__(self) -> None:
         for name in ("batch", "window", "stride"):
@@ -151,6 +153,7 @@ _RATES_1: Final[Mapping[Part, float]] = MappingProxyType(
         "presence_head": 5e-4,
     }
 )
+_RATES_SCRATCH: Final[Mapping[Part, float]] = MappingProxyType(dict.fromkeys(PARTS, 5e-4))
 _RATES_2: Final[Mapping[Part, float]] = MappingProxyType({"camera_head": 5e-5})
 
 
@@ -208,12 +211,16 @@ OPTIONS: Final[Mapping[str, Callable[[Recipe], Recipe]]] = MappingProxyType(
         "one-source": lambda given: replace(given, sources="one"),
         "visible": lambda given: replace(given, presence="visible"),
         "augment": lambda given: replace(given, augment=True),
+        "views": lambda given: replace(given, views=True),
+        "scratch": lambda given: replace(given, init="random", learning_rates=_RATES_SCRATCH),
         "fp32": lambda given: replace(given, optimisation=replace(given.optimisation, bf16=False)),
     }
 )
 """What may follow a base, each after a ``+``: world and no-world (the paper's fourth objective),
 no-image, random and pretrained (what to begin with), one-source, visible (presence learns the
-visible share of a hand), augment (colours), fp32 (no autocast)."""
+visible share of a hand), augment (colours), views (mirrored and cropped windows), scratch (random,
+and one learning rate for all parts: nothing is known yet that a lower one would keep), fp32 (no
+autocast)."""
 
 
 def recipe_named(name: str) -> Recipe:

@@ -35,9 +35,11 @@ from mint_hub.training.trainer import (
     STAGING,
     MintTrainer,
     Pace,
+    compile_layers,
     last_checkpoint,
     training_arguments,
 )
+from mint_hub.training.views import ViewAugmentation
 
 __all__ = ["MODEL", "RUN", "Report", "Request", "train"]
 
@@ -69,6 +71,10 @@ class Request:
         cpu: train on the CPU even where there is a GPU.
         progress: show a bar.
         fsdp: shard the network's layers over processes (FSDP2) instead of copying it to each.
+        cache: folder for surveys and decoded pictures, shared by runs on the same data; None:
+            surveys lie in ``out``, pictures are decoded whenever they are read.
+        attention: implementation, "sdpa" or "eager" (faster on a CPU where windows are short).
+        compile: compile the network's layers (torch.compile; on a CPU it needs a C++ compiler).
 
     """
 
@@ -89,6 +95,9 @@ class Request:
     cpu: bool = False
     progress: bool = False
     fsdp: bool = False
+    cache: Path | None = None
+    attention: str = "sdpa"
+    compile: bool = False
 
 
 @dataclass(frozen=True)
@@ -151,12 +160,23 @@ def train(request: Request) -> Report:
         return Report(done, _step(checkpoint), _step(checkpoint), _log(out), windows.warnings)
     set_seed(request.recipe.optimisation.seed)
     model = MintModel(config) if checkpoint is not None else _model(request, config)
+    model.set_attn_implementation(request.attention)
+    if request.compile:
+        compile_layers(model)
+    if request.cache is not None:
+        with arguments.main_process_first(desc="pictures"):
+            windows = windows.cached(request.cache, request.recipe.views, request.progress)
     trainer = MintTrainer(
         model,
         request.recipe,
         request.pace,
         arguments,
-        PositionDataset(windows, request.pace.steps * request.recipe.batch, _augmentation(request)),
+        PositionDataset(
+            windows,
+            request.pace.steps * request.recipe.batch,
+            _augmentation(request),
+            ViewAugmentation() if request.recipe.views else None,
+        ),
         _validation(request, windows, out),
         _Card(request, facts),
     )
@@ -237,9 +257,13 @@ def _settings(request: Request) -> WindowSettings:
 def _windows(request: Request, config: MintConfig, out: Path) -> TrainingWindows:
     splits = find_splits(request.data, "train", request.noise, request.recipe.optimisation.seed)
     processor = MintProcessor.for_config(config)
-    windows = open_windows(splits, _settings(request), processor, out / SURVEYS)
+    windows = open_windows(splits, _settings(request), processor, _surveys(request, out))
     windows.order()  # a mixture that names no source of these is refused now
     return windows
+
+
+def _surveys(request: Request, out: Path) -> Path:
+    return out / SURVEYS if request.cache is None else request.cache
 
 
 def _check_windows(request: Request, config: MintConfig, windows: TrainingWindows) -> None:
@@ -274,7 +298,8 @@ def _validation(request: Request, windows: TrainingWindows, out: Path) -> Traini
         allow_evaluation_clips=True,
     )
     splits = find_splits(request.validation or request.data, "validation")
-    return open_windows(splits, settings, windows.processor, out / SURVEYS, windows.scales)
+    kept = _surveys(request, out)
+    return open_windows(splits, settings, windows.processor, kept, windows.scales)
 
 
 # --- the record -----------------------------------------------------------------------------------
@@ -302,6 +327,7 @@ def _facts(request: Request, config: MintConfig, windows: TrainingWindows) -> di
         "sources": dict(zip(windows.sources, windows.sizes, strict=True)),
         "mixture": None if request.mixture is None else dict(request.mixture),
         "augmentation": repr(_augmentation(request)),
+        "views": repr(ViewAugmentation()) if recipe.views else None,
         "noise": None if request.noise is None else asdict(request.noise),
     }
     return json.loads(json.dumps(facts))

@@ -21,12 +21,20 @@ from transformers.training_args import TrainingArguments
 from transformers.utils import logging as transformers_logging
 
 from mint_hub.loaders.atomic import replacing
+from mint_hub.model.layers_mint import MintLayer
 from mint_hub.model.modeling_mint import MintModel
 from mint_hub.training.data import PositionDataset, TrainingWindows, collate
 from mint_hub.training.recipes import PARTS, Optimisation, Recipe
 from mint_hub.training.validation import gathered, score_windows, spread_numbers
 
-__all__ = ["MintTrainer", "Pace", "last_checkpoint", "prepare", "training_arguments"]
+__all__ = [
+    "MintTrainer",
+    "Pace",
+    "compile_layers",
+    "last_checkpoint",
+    "prepare",
+    "training_arguments",
+]
 
 STAGING: Final = ".saving"
 LOG: Final = "log.jsonl"
@@ -148,6 +156,13 @@ def prepare(model: MintModel, recipe: Recipe) -> None:
     model.loss_settings = recipe.loss
 
 
+def compile_layers(model: MintModel) -> None:
+    """Compile each transformer layer in place; scores during training run as they are."""
+    for module in model.modules():
+        if isinstance(module, MintLayer):
+            module.compile()
+
+
 def last_checkpoint(out: Path) -> Path | None:
     """Return the newest checkpoint of a run, or None."""
     found = [path for path in out.glob(f"{_PREFIX}*") if path.name[len(_PREFIX) :].isdigit()]
@@ -267,7 +282,8 @@ class MintTrainer(Trainer):
         shared = len(numbers) // world * world
         mine = numbers[rank:shared:world] if shared else numbers
         network: Any = self.accelerator.unwrap_model(self.model)
-        scores = score_windows(network, self.validation, mine, self.recipe.optimisation.bf16)
+        with torch.compiler.set_stance("force_eager"):
+            scores = score_windows(network, self.validation, mine, self.recipe.optimisation.bf16)
         scores = gathered(scores) if shared else scores
         metrics = {f"{metric_key_prefix}_{k}": v for k, v in scores.metrics().items()}
         self.log(dict(metrics))

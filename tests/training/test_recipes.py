@@ -65,7 +65,7 @@ def test_every_option_changes_a_stage_1_recipe():
     base = recipe_named("paper-stage1")
     for option in OPTIONS:
         changed = recipe_named(f"paper-stage1+{option}")
-        fields = ("loss", "init", "sources", "presence", "augment", "optimisation")
+        fields = ("loss", "init", "sources", "presence", "augment", "views", "optimisation")
         same = all(getattr(changed, f) == getattr(base, f) for f in fields)
         assert same == (option == "world"), option  # the paper's has the world already
 

@@ -1,0 +1,91 @@
+"""Mirrored and cropped windows: labels stay exact, pictures are those of the other camera."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mint_hub.geometry.camera import project
+from mint_hub.geometry.hand_model import HandModel
+from mint_hub.training.views import View, ViewAugmentation
+from tests.training.corpus import training_episode
+
+HAND = HandModel.template()
+MIRROR = np.diag([-1.0, 1.0, 1.0])
+
+
+def episode():
+    return replace(training_episode("e0", 12), image_size_hw=(60, 90))
+
+
+def joints_of(ep):
+    return np.asarray(HAND.keypoints(ep.hand_state.astype(float)))
+
+
+def test_a_mirrored_window_is_the_mirrored_scene():
+    before = episode()
+    after = View(mirror=True).episode(before)
+    np.testing.assert_allclose(joints_of(after), (joints_of(before) @ MIRROR)[:, ::-1], atol=1e-6)
+    np.testing.assert_array_equal(after.presence, before.presence[:, ::-1])
+    np.testing.assert_array_equal(after.presence_score, before.presence_score[:, ::-1])
+    twice = View(mirror=True).episode(after)
+    np.testing.assert_allclose(twice.T_camera_from_world, before.T_camera_from_world, atol=1e-12)
+    np.testing.assert_allclose(twice.hand_state, before.hand_state, atol=1e-6)
+
+
+def test_a_mirrored_camera_sees_the_mirrored_world():
+    before = episode()
+    after = View(mirror=True).episode(before)
+    points = np.random.default_rng(0).normal(size=(7, 3))
+    for old, new in zip(before.T_camera_from_world, after.T_camera_from_world, strict=True):
+        seen = points @ old[:3, :3].T + old[:3, 3]
+        mirrored = points @ MIRROR @ new[:3, :3].T + new[:3, 3]
+        np.testing.assert_allclose(mirrored, seen @ MIRROR, atol=1e-9)
+        assert np.linalg.det(new[:3, :3]) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("view", [View(), View(True), View(False, 0.7), View(True, 0.8)])
+def test_a_point_of_the_scene_is_where_the_labels_project_it(view):
+    """A spot that is drawn at a projected point is found, in the new picture, where it should."""
+    before = episode()
+    v, u = np.mgrid[:60, :90] + 0.5
+    rng = np.random.default_rng(1)
+    for _ in range(8):
+        point = np.array([*rng.uniform(-0.12, 0.12, 2), 0.5])
+        uv, _ = project(point, before.K[0])
+        spot = 255 * np.exp(-((u - uv[0]) ** 2 + (v - uv[1]) ** 2) / 8)
+        image = np.repeat(spot[..., None], 3, -1).astype(np.uint8)
+        seen = view.images(image[None], (40, 50))[0, ..., 0].astype(float)
+        rows, columns = np.mgrid[:40, :50] + 0.5
+        found = np.array([(columns * seen).sum(), (rows * seen).sum()]) / seen.sum()
+        after = replace(view.episode(before), image_size_hw=(40, 50))
+        moved = point @ MIRROR if view.mirror else point
+        expected, _ = project(moved, after.K[0])
+        np.testing.assert_allclose(found, expected, atol=0.1)
+
+
+def test_hands_outside_a_crop_are_not_present():
+    before = episode()
+    state = before.hand_state.copy()
+    state[..., :3] = [0.0, 0.0, 2.0]
+    state[:, 1, 0] = 0.9 * 2.0 * np.tan(before.fov_vh_rad[0, 1] / 2)  # near the picture's border
+    seen = np.ones_like(before.presence)
+    before = replace(before, hand_state=state, presence=seen, presence_score=seen * np.float32(0.9))
+    after = View(zoom=0.5).episode(before)
+    assert after.presence[:, 0].all()
+    assert not after.presence[:, 1].any()
+    assert (after.presence_score[:, 1] == 0).all()
+    assert (after.presence_score[:, 0] == np.float32(0.9)).all()
+    np.testing.assert_allclose(
+        np.tan(after.fov_vh_rad / 2), 0.5 * np.tan(before.fov_vh_rad / 2), rtol=1e-5
+    )
+
+
+def test_views_are_drawn_as_said_and_bad_ones_refused():
+    rng = np.random.default_rng(0)
+    drawn = [ViewAugmentation(mirror=0.3, zoom=0.6)(rng) for _ in range(600)]
+    assert np.mean([v.mirror for v in drawn]) == pytest.approx(0.3, abs=0.06)
+    assert np.mean([v.zoom == 1 for v in drawn]) == pytest.approx(0.5, abs=0.06)
+    assert min(v.zoom for v in drawn) > 0.6
+    with pytest.raises(ValueError, match="zoom: expected more than 0, at most 1, got 0"):
+        View(zoom=0)
