@@ -43,16 +43,17 @@ class ColourAugmentation:
         """Change pictures (T, 3, H, W) in [0, 1]; they stay in [0, 1]."""
 
         def factor(size: float, count: int = 1) -> torch.Tensor:
-            drawn = np.exp(rng.uniform(-size, size, count)).astype(np.float32)
-            return torch.from_numpy(drawn).view(-1, 1, 1)
+            return torch.from_numpy(np.exp(rng.uniform(-size, size, count)).astype(np.float32))
 
         x = pixels.clamp(0, 1) ** factor(self.gamma)
-        x = x * factor(self.exposure) * factor(self.white, 3)
-        mean = x.mean()
-        x = mean + (x - mean) * factor(self.contrast)
-        luma = (x * torch.tensor(_LUMA).view(3, 1, 1)).sum(1, keepdim=True)
-        colour = 0.0 if rng.random() < self.grey else factor(self.saturation)
-        x = luma + (x - luma) * colour
+        light = factor(self.exposure) * factor(self.white, 3)
+        mean = (x.mean((0, 2, 3)) * light).mean()
+        contrast = factor(self.contrast)
+        colour = torch.zeros(1) if rng.random() < self.grey else factor(self.saturation)
+        # Contrast about the mean and saturation about the luma, in one matrix of colours.
+        mixed = colour * torch.eye(3) + (1 - colour) * torch.tensor(_LUMA)
+        x = (contrast * mixed * light) @ x.flatten(2)
         size, seed = float(rng.uniform(0, self.noise)), int(rng.integers(2**31))
-        generator = torch.Generator().manual_seed(seed)
-        return (x + size * torch.randn(x.shape, generator=generator)).clamp(0, 1)
+        noise = torch.randn(x.shape, generator=torch.Generator().manual_seed(seed))
+        x = x.add_((1 - contrast) * mean).add_(noise, alpha=size).clamp_(0, 1)
+        return x.view(pixels.shape)
