@@ -61,7 +61,7 @@ class MintEgo(datasets.GeneratorBasedBuilder):
                 raise ValueError(f"{name}: {NAME!r} takes none; say location=, and pick columns")
         if config_name is None:
             warnings.warn(
-                f"{NAME}: reading the embedded {SAMPLE!r}, one synthetic episode; the corpus is "
+                f"{NAME}: reading the embedded {SAMPLE!r}, three synthetic clips; the corpus is "
                 f'load_dataset("{NAME}", "{ALL}"), its parts are {", ".join(PARTS)}',
                 stacklevel=4,
             )

@@ -25,6 +25,14 @@ def add_synth(commands: Any) -> None:
     add("--split", choices=("train", "validation"), help="default: train; of benches: validation")
     add("--frames", type=int, help="frames of every clip (default: 150 to 240, drawn)")
     add("--scale", type=float, default=1.0, help="factor on the size of pictures (default: 1)")
+    add(
+        "--lens",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="share of clips, 0 to 1, whose pictures are bent by a lens; labels stay those of the "
+        "pinhole that rectifying with meta synth.lens gives; train only (default: 0)",
+    )
     add("--depth", action="store_true", help="also store depth")
     add("--segmentation", action="store_true", help="also store segments")
     add("--jobs", type=int, default=1, help="processes that make clips (default: 1)")
@@ -40,6 +48,8 @@ def _synth(args: argparse.Namespace) -> int:
         raise ValueError(f"--jobs: expected at least 1, got {args.jobs}")
     if args.episodes is None and args.preset == "train":
         raise ValueError("--episodes: expected how many clips of train to make, got none")
+    if args.out.exists() and not args.out.is_dir():
+        raise ValueError(f"-o {args.out}: expected a folder, got a file")
     report = synthesise(
         args.out,
         args.preset,
@@ -49,6 +59,7 @@ def _synth(args: argparse.Namespace) -> int:
         split=args.split,
         num_frames=args.frames,
         scale=args.scale,
+        lens=args.lens,
         depth=args.depth,
         segmentation=args.segmentation,
         num_procs=args.jobs,

@@ -18,7 +18,8 @@ from mint_hub.cli import main
 from mint_hub.loaders.lerobot import to_lerobot
 from mint_hub.loaders.packing import pixel_window
 from mint_hub.loaders.reader import CorpusReader
-from mint_hub.loaders.shards import split_of
+from mint_hub.loaders.schema import Episode
+from mint_hub.loaders.shards import split_of, write_corpus
 from tests.corpus_faults import tree
 from tests.episodes import make_episode
 from tests.loaders.test_vitra import annotation
@@ -286,8 +287,9 @@ def test_pack_puts_pixels_beside_labels(tmp_path, capsys):
     corpus, videos = tmp_path / "packed", tmp_path / "videos"
     videos.mkdir()
     shutil.copy(asset_path("sample.mp4"), videos / "sample.mp4")
-    labels = str(asset_path("sample_corpus"))
-    call = ["pack", labels, "--config", "sample", "-o", str(corpus), "--size", "72x96"]
+    labels = tmp_path / "labels"
+    write_corpus([Episode.load(asset_path("sample.npz"))], labels, "sample", "train")
+    call = ["pack", str(labels), "--config", "sample", "-o", str(corpus), "--size", "72x96"]
     assert main([*call, "--videos", str(videos / "sample.mp4")]) == 0
     reader = CorpusReader(corpus, "sample-video", "train")
     episode, images = pixel_window(reader, 0, 10, 4)[:2]

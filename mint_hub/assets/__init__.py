@@ -18,5 +18,5 @@ def asset_path(name: str) -> Path:
 
 
 def sample_clip() -> Path:
-    """Return the path of the embedded clip: three synthetic seconds with exact truth beside it."""
+    """Return the path of the embedded clip: four synthetic seconds with exact truth beside it."""
     return asset_path("sample.mp4")

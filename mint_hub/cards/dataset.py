@@ -33,7 +33,7 @@ NOT_STATED: Final = "not stated"
 
 _GET: Final = {"ego4d": GET_EGO4D, "epic": GET_EPIC, "egodex": GET_EGODEX}
 _HOLDS: Final = {
-    SAMPLE: "one synthetic episode, embedded in mint-hub",
+    SAMPLE: "three synthetic clips with their pictures, embedded in mint-hub",
     ALL: "the shards of all sources",
     "lossless": "all 109 numbers a hand a frame in float32, for sources whose hand shape varies",
 }

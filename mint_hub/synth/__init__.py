@@ -1,5 +1,5 @@
-"""What was made, not recorded: the licence-free hand, the sample clip, and how they are drawn.
+"""What was made, not recorded: synthetic clips with exact labels, and the licence-free hand.
 
-The generators are scripts (`python -m mint_hub.synth.make_hand`, `draw_hand`, `make_sample`); their
-results travel in `mint_hub/assets`.
+`episodes` makes clips and corpora of them (`mint-hub synth`). What travels in `mint_hub/assets` is
+made by scripts: `python -m mint_hub.synth.make_hand`, `draw_hand`, `make_sample`.
 """

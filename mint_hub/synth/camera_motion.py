@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,12 @@ from mint_hub.synth.motion import minimum_jerk, smooth_noise
 __all__ = ["HeadStyle", "camera_path", "draw_style", "median_steps"]
 
 Floats = NDArray[np.float64]
+
+TURN_RAD_S: Final = float(np.deg2rad(90))
+"""Fastest turn of the head that follows the work: three degrees a frame."""
+
+QUICK_TURN_RAD_S: Final = float(np.deg2rad(170))
+"""Fastest turn of a quick look elsewhere and back."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,23 +117,37 @@ def _gaze_path(
 ) -> Floats:
     """Point that the head turns to, (T, 3): overlapping minimum-jerk shifts."""
     centre = np.array([0.0, 0.26, 0.03])
-    events: list[tuple[float, Floats, float]] = []
+    events: list[tuple[float, Floats, float, float]] = []
     for time, point in sorted(gaze, key=lambda g: g[0]):
         goal = centre + style.follow * (point - centre)
-        events.append((time, goal, float(rng.uniform(0.45, 0.75))))
+        events.append((time, goal, float(rng.uniform(0.45, 0.75)), TURN_RAD_S))
     for start, point, stay in style.away:
         before = [e for e in events if e[0] <= start]
         back = before[-1][1] if before else centre
-        events = [e for e in events if not start - 0.1 < e[0] < start + stay + 0.3]
-        events += [(start, point, 0.34), (start + 0.25 + stay, back, 0.40)]
+        there = _duration(style.eye, back, point, 0.34, QUICK_TURN_RAD_S)
+        gone = start + there + stay
+        events = [e for e in events if not start - 0.1 < e[0] < gone + 0.3]
+        events += [(start, point, 0.34, QUICK_TURN_RAD_S), (gone, back, 0.40, QUICK_TURN_RAD_S)]
     events.sort(key=lambda e: e[0])
-    past = [e for e in events if e[0] < float(t[0]) - 0.8]
+    past = [e for e in events if e[0] < float(t[0]) - 1.2]
     at = past[-1][1] if past else centre
     path = np.tile(at, (len(t), 1)).astype(float)
-    for time, goal, duration in events[len(past) :]:
+    for time, goal, least, speed in events[len(past) :]:
+        duration = _duration(style.eye, at, goal, least, speed)
         path = path + minimum_jerk((t - time) / duration)[:, None] * (goal - at)
         at = goal
     return path
+
+
+def _duration(eye: Floats, start: Floats, stop: Floats, least: float, speed: float) -> float:
+    """Seconds of a shift of gaze whose fastest turn is at most ``speed``, radians a second.
+
+    On the chord between two directions an angle a turns as 2 tan(a / 2) would in its middle, where
+    a minimum-jerk shift runs at 15 / 8 of its mean speed.
+    """
+    first, second = (d / np.linalg.norm(d) for d in (start - eye, stop - eye))
+    angle = min(2 * np.arcsin(min(np.linalg.norm(second - first) / 2, 1.0)), np.deg2rad(150))
+    return max(least, float(15 / 8 * 2 * np.tan(angle / 2) / speed))
 
 
 def median_steps(T_camera_from_work: Floats) -> tuple[float, float]:

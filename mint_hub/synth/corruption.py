@@ -28,6 +28,17 @@ LONGEST_STEP_PX: Final = 1.5
 MOST_STEPS: Final = 11
 _LEVELS: Final = 4096
 
+_LIMITS: Final = {
+    "shutter": (0.0, 1.0),
+    "vignette": (0.0, 1.0),
+    "crf": (0.0, 51.0),
+    "exposure": (-6.0, 6.0),
+    "contrast": (0.2, 4.0),
+}
+
+TONE_MIDDLE: Final = 0.45
+"""Code value, of 1, that contrast leaves as it is."""
+
 
 @dataclass(frozen=True)
 class Corruption:
@@ -42,6 +53,8 @@ class Corruption:
         shot_noise: standard deviation of the noise of white, in its share, growing with light.
         read_noise: standard deviation of the noise of black.
         crf: of the H.264 that `encode` makes, 0 (best) to 51.
+        exposure: stops by which pictures are brighter (or, below 0, darker) than they were drawn.
+        contrast: slope of the tone curve about its middle, in code values; its ends are soft.
 
     """
 
@@ -53,13 +66,17 @@ class Corruption:
     shot_noise: float = 0.0
     read_noise: float = 0.0
     crf: int = 18
+    exposure: float = 0.0
+    contrast: float = 1.0
 
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            high = {"shutter": 1.0, "vignette": 1.0, "crf": 51}.get(field.name, np.inf)
-            if not 0 <= value <= high:
-                raise ValueError(f"corruption, {field.name}: expected 0 to {high}, got {value}")
+            low, high = _LIMITS.get(field.name, (0.0, np.inf))
+            if not low <= value <= high:
+                raise ValueError(
+                    f"corruption, {field.name}: expected {low:g} to {high:g}, got {value}"
+                )
 
 
 def corrupt(
@@ -107,7 +124,7 @@ def corrupt(
             noise = rng.standard_normal(linear.shape, np.float32)
             level = settings.shot_noise**2 * linear + settings.read_noise**2
             linear = linear + noise * np.sqrt(level)
-        yield replace(frame, rgb=_to_code(linear))
+        yield replace(frame, rgb=_to_code(linear, settings.contrast))
 
 
 def encode(frames: Iterable[Rendered], settings: Corruption, fps: float = 30.0) -> bytes:
@@ -122,8 +139,10 @@ def covering_fov(lens: Lens) -> tuple[float, float]:
         ValueError: the lens sees 170 degrees or more across, which no pinhole does well.
 
     """
-    rays = _rays(lens)
-    seen = rays[np.isfinite(rays).all(-1)]
+    seen = _border(lens)
+    if not np.isfinite(seen).all():  # a circle in the picture: the border is not what ends it
+        rays = _rays(lens)
+        seen = rays[np.isfinite(rays).all(-1)]
     with np.errstate(divide="ignore", invalid="ignore"):
         tangents = np.abs(seen[:, :2] / seen[:, 2:]).max(0)
     if (seen[:, 2] <= 0).any() or tangents.max() > np.tan(np.deg2rad(85.0)):
@@ -150,6 +169,15 @@ def lens_maps(
         seen = (rays[..., 2] > 0) & (np.abs(2 * x - width + 1) <= width)
         seen &= np.abs(2 * y - height + 1) <= height
     return tuple(np.where(seen, m, -2.0).astype(np.float32) for m in (x, y))  # pyright: ignore[reportReturnType]
+
+
+def _border(lens: Lens) -> NDArray[np.float64]:
+    """Rays (N, 3) of the outermost pixels: a lens is one-to-one, so none is further out."""
+    height, width = lens.image_size_hw
+    rows, columns = np.arange(height), np.arange(width)
+    sides = [(columns, 0), (columns, height - 1), (0, rows), (width - 1, rows)]
+    uv = [np.stack(np.broadcast_arrays(u, v), -1) for u, v in sides]
+    return np.asarray(lens.unproject(np.concatenate(uv).astype(np.float64)))
 
 
 def _rays(lens: Lens) -> NDArray[np.float64]:
@@ -190,7 +218,7 @@ def _gain(
     image_size_hw: tuple[int, ...], settings: Corruption, drift: NDArray[np.float64]
 ) -> NDArray[np.float32]:
     """Factor (H, W, 3) or (1, 1, 3) on the light."""
-    stops = settings.exposure_drift * drift[0]
+    stops = settings.exposure + settings.exposure_drift * drift[0]
     tint = settings.white_drift * drift[1] / 2
     colour = np.exp2(stops + tint * np.array([1.0, 0.0, -1.0])).astype(np.float32)
     if settings.vignette == 0:
@@ -207,11 +235,20 @@ def _to_linear() -> NDArray[np.float32]:
 
 
 @cache
-def _codes() -> NDArray[np.uint8]:
-    """Codes of the square root of linear light in _LEVELS steps: fine in the dark."""
-    return np.round(255 * (np.arange(_LEVELS) / (_LEVELS - 1)) ** (2 / 2.2)).astype(np.uint8)
+def _codes(contrast: float) -> NDArray[np.uint8]:
+    """Codes of the square root of linear light in _LEVELS steps: fine in the dark.
+
+    Contrast other than 1 bends them by a smooth curve through TONE_MIDDLE that stays in 0 to 1.
+    """
+    code = (np.arange(_LEVELS) / (_LEVELS - 1)) ** (2 / 2.2)
+    if contrast != 1:
+        low = TONE_MIDDLE * (code / TONE_MIDDLE) ** contrast
+        rest = 1 - TONE_MIDDLE
+        high = 1 - rest * (np.maximum(1 - code, 0) / rest) ** contrast
+        code = np.where(code < TONE_MIDDLE, low, high)
+    return np.round(255 * code).astype(np.uint8)
 
 
-def _to_code(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
+def _to_code(linear: NDArray[np.float32], contrast: float) -> NDArray[np.uint8]:
     root = np.sqrt(np.clip(linear, 0, 1)) * (_LEVELS - 1) + 0.5
-    return _codes()[root.astype(np.uint16)]
+    return _codes(contrast)[root.astype(np.uint16)]

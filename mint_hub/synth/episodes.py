@@ -99,6 +99,8 @@ def draw_corruption(world: World) -> Corruption:
         shot_noise=round(float(rng.uniform(0, 0.02)), 4),
         read_noise=round(float(rng.uniform(0, 0.006)), 4),
         crf=int(rng.integers(18, 27)),
+        exposure=round(float(rng.uniform(-1.4, 0.3)), 3),
+        contrast=round(float(rng.uniform(1.0, 2.0)), 3),
     )
 
 
@@ -231,6 +233,7 @@ def make_clip(
     lens: float = 0.0,
     depth: bool = False,
     segmentation: bool = False,
+    corruption: Corruption | None = None,
 ) -> Clip:
     """Make a world and draw it, with a renderer of its own; see ``scene.make_world``.
 
@@ -249,7 +252,9 @@ def make_clip(
     drawn = draw_lens(world, lens)
     world = world if drawn is None else seen_through(world, drawn)
     with Renderer(world.image_size_hw) as renderer:
-        return make_episode(world, renderer, depth=depth, segmentation=segmentation)
+        return make_episode(
+            world, renderer, depth=depth, segmentation=segmentation, corruption=corruption
+        )
 
 
 def _check_scale(scale: float) -> float:

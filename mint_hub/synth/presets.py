@@ -32,6 +32,7 @@ __all__ = [
     "BENCH_CLIPS",
     "GENERATOR",
     "PRESETS",
+    "RESERVED_SEEDS",
     "Preset",
     "bench_fingerprints",
     "fingerprint",
@@ -47,6 +48,10 @@ GENERATOR: Final = 1
 
 BENCH_CLIPS: Final = 40
 BENCH_FILE: Final = "synth_benches.txt"
+
+RESERVED_SEEDS: Final = 1 << 48
+"""Worlds of train from this seed on are set apart: no run of `mint-hub synth` draws them, whatever
+its seed (`seed_of` stays below). The clips that travel with the package are of these."""
 
 PresetName = Literal["train", "bench", "bench-ood"]
 Range = tuple[float, float]
@@ -149,7 +154,9 @@ def seed_of(preset: str, seed: int, number: int) -> int:
         if number >= kind.clips:
             raise ValueError(f"number: {preset} has {kind.clips} clips, got {number}")
         return number
-    return int.from_bytes(hashlib.sha256(f"{seed}:{number}".encode()).digest()[:6], "big")
+    drawn = int.from_bytes(hashlib.sha256(f"{seed}:{number}".encode()).digest()[:6], "big")
+    assert drawn < RESERVED_SEEDS
+    return drawn
 
 
 def on_grid(value: Any, steps: int) -> Any:

@@ -1,8 +1,6 @@
-"""A small z-buffered rasteriser in numpy, shared by the scripts that draw our assets.
+"""A small z-buffered rasteriser in numpy, for the sheet of hands, and the normals of any mesh.
 
-Everything is linear on the screen, which is right as it stands for an orthographic view. For a
-perspective view give -1 / z as the third coordinate (it grows with z and is linear on the screen)
-and attributes divided by z, one of them 1 / z itself, to divide by afterwards.
+Everything is linear on the screen, which is right as it stands for an orthographic view.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ def test_pixels_and_labels_of_the_same_frames(truth):
     assert window.images.shape == (16, 144, 240, 3)
     assert window.episode.image_size_hw == (144, 240)
     np.testing.assert_array_equal(window.episode.hand_state, labels.hand_state)
-    scale = np.diag([240 / 384, 144 / 288, 1])
+    scale = np.diag([240 / 384, 144 / 294, 1])
     np.testing.assert_allclose(window.episode.K, scale @ labels.K, atol=1e-9)
     video = VideoAttachment(truth, sample_clip())
     error = [
@@ -61,7 +61,7 @@ def test_pixels_and_labels_of_the_same_frames(truth):
     ]
     assert error[1] < 4
     assert error[1] < min(error[0], error[2]) / 2
-    with pytest.raises(VideoError, match=r"mp4: expected 40 frames, got 90 \(episode sample\)"):
+    with pytest.raises(VideoError, match=r"mp4: expected 40 frames, got 120 \(episode sample\)"):
         read_window(truth.window(0, 40), members[MP4])
 
 

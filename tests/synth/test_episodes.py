@@ -2,12 +2,18 @@
 
 import dataclasses
 import io
+import sys
 
+import cv2
 import numpy as np
 import pytest
 
 from mint_hub.cli import main
+from mint_hub.conventions import KEYPOINT_NAMES
+from mint_hub.geometry.camera import fov_vh_to_K, on_screen, project, unproject
 from mint_hub.geometry.hand_model import HandModel
+from mint_hub.geometry.lenses import Lens
+from mint_hub.geometry.rigid import inverse, transform_points
 from mint_hub.loaders.clips import PackedClip
 from mint_hub.loaders.integrity import verify
 from mint_hub.loaders.packing import pixel_window
@@ -20,6 +26,7 @@ from mint_hub.synth.render import Renderer
 from mint_hub.synth.scene import make_world
 
 FRAMES = 6
+TIPS = np.array([name.endswith("tip") for name in KEYPOINT_NAMES])
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +85,58 @@ def test_members_are_the_frames(drawn, world):
     assert np.abs(depth - true)[near].max() <= DEPTH_STEP_M
     segments = np.load(io.BytesIO(clip.members["segmentation.npz"]))["segmentation"]
     assert np.array_equal(segments, np.stack([f.segmentation for f in frames]))
+
+
+@pytest.fixture(scope="module", params=[("bench", 3), ("bench-ood", 5), ("train", 33)])
+def made(request, renderer):
+    """A world as it is made, what is drawn of it, and each hand drawn alone."""
+    preset, seed = request.param
+    world = make_world(seed, preset, 4)
+    with Renderer(world.image_size_hw) as own:
+        frames = list(own.frames(world, ("depth", "segmentation", "flow")))
+        alone = np.stack([own.hand_masks(world, k) for k in range(len(frames))])
+    return world, frames, alone
+
+
+def test_joints_lie_on_the_hand_of_made_worlds(made):
+    """The skeleton always; the tips, which are on the surface, within a pixel."""
+    world, _, alone = made
+    keypoints = HandModel.template().keypoints(world.hands.hand_state.astype(float))
+    K = fov_vh_to_K(np.asarray(world.fov_vh_rad), world.image_size_hw)
+    exact, near = [], []
+    for k, hand in np.argwhere(world.hands.exists):
+        uv, z = project(keypoints[k, hand], K)
+        uv = uv[on_screen(uv, z, world.image_size_hw)]
+        tips = TIPS[on_screen(*project(keypoints[k, hand], K), world.image_size_hw)]
+        column, row = np.floor(uv).astype(int).T
+        mask = alone[k, hand]
+        grown = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
+        near += list(grown[row, column])
+        exact += list(mask[row, column][~tips])
+    assert len(exact) > 40
+    assert np.mean(exact) == 1.0
+    assert np.mean(near) >= 0.99
+
+
+def test_pose_and_depth_of_made_worlds_agree_from_frame_to_frame(made):
+    """What stands still is at the depth, and moves by the flow, that the cameras' motion says."""
+    world, frames, _ = made
+    T, size = world.T_camera_from_world, world.image_size_hw
+    K = fov_vh_to_K(np.asarray(world.fov_vh_rad), size)
+    first, last = frames[0], frames[-1]
+    row, column = np.nonzero(last.segmentation == 4)
+    points = unproject(np.stack([column, row], -1) + 0.5, last.depth[row, column].astype(float), K)
+    uv, z = project(transform_points(T[0] @ inverse(T[-1]), points), K)
+    seen = on_screen(uv, z, size)
+    there = np.floor(uv[seen]).astype(int).T[::-1]
+    both = first.segmentation[tuple(there)] == 4
+    error = np.abs(first.depth[tuple(there)] - z[seen])[both] / z[seen][both]
+    assert both.sum() > 2000
+    assert np.median(error) < 0.005
+    assert np.mean(error < 0.03) > 0.9
+    before, _ = project(transform_points(T[-2] @ inverse(T[-1]), points), K)
+    off = np.stack([column, row], -1) + 0.5 - before - last.flow[row, column]
+    assert np.median(np.linalg.norm(off, axis=-1)) < 0.01
 
 
 def test_presence_is_any_joint_in_the_image(world):
@@ -168,11 +227,69 @@ def test_the_command_line_makes_a_bench_clip(renderer, tmp_path, capsys):
     [
         ([], "--episodes: expected how many"),
         (["--episodes", "0"], "episodes: expected at least 1"),
+        (["--episodes", "-3", "--preset", "bench"], "episodes: expected at least 1"),
         (["--episodes", "1", "--jobs", "0"], "--jobs: expected at least 1"),
+        (["--episodes", "1", "--frames", "0"], "num_frames: expected at least 1, got 0"),
         (["--episodes", "1", "--seed", "-2"], "seed: expected 0 or more, got -2"),
+        (["--episodes", "1", "--scale", "0"], "scale: expected 0.1 to 4, got 0.0"),
+        (["--episodes", "1", "--scale", "nan"], "scale: expected 0.1 to 4, got nan"),
+        (["--episodes", "1", "--lens", "1.1"], "lens: expected a share of clips from 0 to 1"),
+        (["--lens", "0.5", "--preset", "bench"], "lens: expected 0 for bench"),
         (["--episodes", "41", "--preset", "bench"], "bench has 40 clips"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message, tmp_path, capsys):
     assert main(["synth", *arguments, "-o", str(tmp_path), "--quiet"]) == 2
-    assert message in capsys.readouterr().err
+    said = capsys.readouterr().err.strip()
+    assert message in said
+    assert "\n" not in said
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_where_the_corpus_should_be_is_named(tmp_path, capsys):
+    (tmp_path / "taken").write_text("mine")
+    call = ["synth", "--episodes", "1", "-o", str(tmp_path / "taken"), "--quiet"]
+    assert main(call) == 2
+    said = capsys.readouterr().err.strip()
+    assert "expected a folder, got a file" in said
+    assert "\n" not in said
+    assert (tmp_path / "taken").read_text() == "mine"
+
+
+def test_an_unknown_preset_is_named(tmp_path, capsys):
+    with pytest.raises(SystemExit) as left:
+        main(["synth", "--preset", "kitchen", "--episodes", "1", "-o", str(tmp_path)])
+    assert left.value.code == 2
+    assert "invalid choice: 'kitchen'" in capsys.readouterr().err
+    with pytest.raises(ValueError, match=r"preset: expected one of .*'train'.*, got 'kitchen'"):
+        synthesise(tmp_path, "kitchen", 1)
+
+
+class WithoutEgl:
+    """A moderngl that finds no driver."""
+
+    @staticmethod
+    def create_standalone_context(**_):
+        raise OSError("libEGL.so: cannot open shared object file")
+
+
+@pytest.mark.parametrize(
+    ("module", "message"),
+    [(None, 'pip install "mint-hub[synth]"'), (WithoutEgl, "libegl1 libgl1-mesa-dri")],
+)
+def test_what_is_missing_is_one_line(module, message, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "moderngl", module)
+    call = ["synth", "--episodes", "1", "--frames", "1", "-o", str(tmp_path), "--quiet"]
+    assert main(call) == 2
+    said = capsys.readouterr().err.strip()
+    assert message in said
+    assert "\n" not in said
+
+
+def test_the_command_line_bends_pictures(renderer, tmp_path):
+    call = ["synth", "--episodes", "1", "--frames", "1", "--scale", "0.2", "--lens", "1"]
+    assert main([*call, "--seed", "4", "-o", str(tmp_path), "--quiet"]) == 0
+    (episode,) = CorpusReader(tmp_path, "synth-train", "train")
+    lens = Lens.from_dict(episode.meta["synth"]["lens"])
+    assert lens.image_size_hw == episode.image_size_hw
+    assert any(lens.distortion)
