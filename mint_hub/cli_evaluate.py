@@ -91,7 +91,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
 def _evaluate(args: argparse.Namespace) -> int:
     from mint_hub.evaluation.evaluate import evaluate
     from mint_hub.evaluation.report import write_report
-    from mint_hub.evaluation.tables import all_tables
+    from mint_hub.evaluation.tables import main_tables
     from mint_hub.evaluation.trivial import MeanHand
 
     source = _source(args)
@@ -109,8 +109,8 @@ def _evaluate(args: argparse.Namespace) -> int:
     path = write_report(results, folder, source, predictor, mean)
     for warning in results.warnings:
         print(f"warning: {warning}", file=sys.stderr)
-    for table in all_tables(results)[:1]:
-        print(table.markdown())
+    for table in main_tables(results):
+        print(table.text())
     print(f"results, tables and report: {path}")
     return 0
 
@@ -128,7 +128,7 @@ def _compare(args: argparse.Namespace) -> int:
         source = Source(kind, args.a, config=args.config, split=args.split, mano_dir=args.mano)
         results = evaluate(source, _predictor(args, args.b, None), jobs=args.jobs)
         print(f"{args.b} scored as if {args.a} were true: agreement, not accuracy.\n")
-        print("\n".join(table.markdown() for table in all_tables(results)))
+        print("\n".join(table.text() for table in all_tables(results)))
         if args.out:
             print(f"written: {results.save(args.out / 'results.json')}")
         return 0
@@ -158,8 +158,12 @@ def _loaded(args: argparse.Namespace, what: str, file: Path | None) -> "Results"
 
     if file is not None:
         return Results.load(file)
+    if not args.on and not Path(what).expanduser().exists():
+        raise ValueError(f"{what}: expected results.json, or a folder with it, found neither")
     if not args.on:
-        raise ValueError(f"{what}: expected results.json, or --on BENCHMARK to evaluate it on")
+        raise ValueError(
+            f"{what}: expected results.json there, or --on BENCHMARK to evaluate it on"
+        )
     return evaluate(_source(args), _predictor(args, what, None), jobs=args.jobs)
 
 

@@ -57,8 +57,11 @@ def test_labels_are_scored_and_written(corpus, labels, tmp_path, capsys):
     call = ["evaluate", labels, "--on", "shards", corpus, "-o", str(tmp_path), "--quiet"]
     assert main([*call, "--name", "mine"]) == 0
     out = capsys.readouterr().out
-    assert "| mine |" in out
-    assert "| always present |" in out
+    heads = next(line for line in out.splitlines() if line.startswith("Hands in the camera frame"))
+    assert heads.split("  ")[1] == "mine"
+    assert "always present" in heads
+    assert out.count("\nRPE-T mean (mm)") == 1
+    assert "| mine |" in (tmp_path / "tables.md").read_text()
     values = json.loads((tmp_path / "results.json").read_text())
     assert values["benchmark"]["clips"] == 3
     assert values["prediction"] == {"name": "mine", "kind": "labels", "episodes": 3}
@@ -106,7 +109,7 @@ def test_weights_have_a_hash_that_follows_them(checkpoint, tmp_path):
 def test_a_checkpoint_needs_pictures(checkpoint, labels, tmp_path):
     from mint_hub.evaluation.evaluate import evaluate
 
-    with pytest.raises(ValueError, match="clip-0: no pictures to run a model on: labels come"):
+    with pytest.raises(ValueError, match=r"clip-0: no pictures to run \S+small on: labels"):
         evaluate(Source("labels", labels), Predictor.of(checkpoint, device="cpu"))
 
 
@@ -154,7 +157,12 @@ def test_bench_without_its_renderer_says_what_to_install(tmp_path, capsys, monke
         (["evaluate", "trivial", "--on", "else"], "--on: expected one of ['bench'"),
         (["evaluate", "trivial", "--on", "hot3d", "no/where"], "found no folder; get sequences"),
         (["evaluate", "./no/model", "--on", "hot3d", "x"], "./no/model: expected a folder"),
+        (["evaluate", "x", "--on", "shards", "no/where"], "no/where: expected a corpus folder"),
         (["compare", "a.json", "b.json"], "a.json: expected results"),
+        (
+            ["compare", "no", "b.json"],
+            "no: expected results.json, or a folder with it, found neither",
+        ),
     ],
 )
 def test_wrong_calls(call, message, capsys):

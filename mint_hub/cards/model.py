@@ -1,17 +1,22 @@
 """The card of the model: ``template.md`` filled from configurations, results and changelog.
 
-Results are what ``mint-hub evaluate`` wrote (``results/*.json``, schema 1; ``clips`` may be left
-out). Each gives a table, trivial rows beside the model's, and entries of the ``model-index``
-in the head. Without results the card says that there are no numbers.
+Results are what ``mint-hub evaluate`` wrote (``results/*.json``, schema 1), kept without ``clips``
+by ``python -m mint_hub.cards --keep``. Those of the same clips share a table, the rows that need no
+model once at its end. Checkpoints also give entries of the ``model-index`` in the head; without any
+the card says so.
 """
 
 import json
+import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from string import Template
 from typing import Any, Final, cast
 
 from mint_hub.cards.sources import CardError
+from mint_hub.geometry.metrics import NOTHING, interval, measure_of, number
+from mint_hub.loaders.atomic import replacing
 from mint_hub.loaders.card import card_text
 from mint_hub.loaders.changelog import Changelog
 from mint_hub.loaders.derived import markdown_table
@@ -21,22 +26,22 @@ RESULTS: Final = "results"
 KIND, SCHEMA = "mint-hub evaluation", 1
 TASK: Final = "keypoint-detection"
 SHOWN: Final = (
-    ("hands", "published", "FAcc", ""),
-    ("hands", "published", "Presence-BA", ""),
-    ("hands", "published", "MPJPE-p", "mm"),
-    ("hands", "published", "PA-MPJPE-p", "mm"),
-    ("hands", "published", "EPE-p", "px"),
-    ("hands", "published", "CT-p", "m"),
-    ("hands", "published", "Jitter", "mm/frame^2"),
-    ("camera", None, "RPE-T mean", "mm"),
-    ("camera", None, "RPE-R mean", "deg"),
-    ("camera", None, "ATE % mean", "% of path"),
-    ("world", "SE(3)", "W-MPJPE", "mm"),
+    ("hands", "published", "FAcc"),
+    ("hands", "published", "Presence-BA"),
+    ("hands", "published", "MPJPE-p"),
+    ("hands", "published", "PA-MPJPE-p"),
+    ("hands", "published", "EPE-p"),
+    ("hands", "published", "CT-p"),
+    ("hands", "published", "Jitter"),
+    ("camera", None, "RPE-T mean"),
+    ("camera", None, "RPE-R mean"),
+    ("camera", None, "ATE % mean"),
+    ("world", "SE(3)", "W-MPJPE"),
 )
-"""Numbers of the card: group, reading or alignment, name, unit."""
+"""Numbers of the card: group, reading or alignment, name."""
 
 NO_RESULTS: Final = (
-    "**No trained checkpoint has been evaluated yet**, so there is no number to print here.\n"
+    "**No trained checkpoint has been evaluated yet**: there is no number of a model here.\n"
 )
 
 
@@ -52,7 +57,7 @@ def render(folder: Path) -> str:
     changes = Changelog.load(folder).changes
     head = card_head(results)
     values = {
-        "results": "\n".join(map(results_section, results)) if results else NO_RESULTS,
+        "results": "\n".join(results_sections(results)),
         "changes": "".join(f"- {c.date}, {c.version}: {c.text}\n" for c in changes),
         **_configurations(),
     }
@@ -68,43 +73,81 @@ def render(folder: Path) -> str:
     return card
 
 
+def keep_results(evaluation: Path, folder: Path) -> Path:
+    """Copy an evaluation's results to where the card finds them: tables, and numbers without clips.
+
+    The file's name is that of benchmark and prediction; an older one of that name is replaced.
+
+    Args:
+        evaluation: folder that ``mint-hub evaluate`` wrote.
+        folder: the card's.
+
+    Raises:
+        CardError: it holds no results, or no tables.
+
+    """
+    values = read_results(evaluation / "results.json")
+    tables = evaluation / "tables.md"
+    if not tables.is_file():
+        raise CardError(f"{tables}: expected this file beside results.json, got none")
+    values.pop("clips", None)
+    who = values["prediction"]["name"] if values["prediction"] else "trivial"
+    name = re.sub(r"[^a-z0-9.]+", "-", f"{values['benchmark']['name']}-{who}".lower()).strip("-.")
+    kept = folder / RESULTS / f"{name}.json"
+    with replacing(kept.with_suffix(".md")) as temporary:
+        temporary.write_text(tables.read_text(encoding="utf-8"), encoding="utf-8")
+    with replacing(kept) as temporary:
+        text = json.dumps(values, indent=1, ensure_ascii=False, allow_nan=False)
+        temporary.write_text(text + "\n", encoding="utf-8")
+    return kept
+
+
 def load_results(folder: Path) -> list[dict[str, Any]]:
     """Read ``results/*.json`` of a folder, in the order of their names; none is fine.
 
     Raises:
-        CardError: a file is no result of an evaluation, or of no checkpoint.
+        CardError: a file is no result of an evaluation.
 
     """
-    found: list[dict[str, Any]] = []
-    for path in sorted((folder / RESULTS).glob("*.json")):
-        try:
-            values: Any = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise CardError(f"{path}: expected JSON, got {error}") from None
-        if not isinstance(values, dict):
-            raise CardError(f"{path}: expected results of `mint-hub evaluate`, got other JSON")
-        given = cast("dict[str, Any]", values)
-        if given.get("kind") != KIND or given.get("schema") != SCHEMA:
-            raise CardError(f"{path}: expected {KIND}, schema {SCHEMA}, got {given.get('kind')!r}")
-        prediction = given.get("prediction")
-        if not isinstance(prediction, dict) or prediction.get("kind") != "checkpoint":
-            raise CardError(f"{path}: expected results of a checkpoint, got of {prediction!r:.80}")
-        found.append(given)
-    return found
+    return [read_results(path) for path in sorted((folder / RESULTS).glob("*.json"))]
+
+
+def read_results(path: Path) -> dict[str, Any]:
+    """Read one file of results.
+
+    Raises:
+        CardError: no such file, or not what ``mint-hub evaluate`` writes.
+
+    """
+    try:
+        values: Any = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise CardError(f"{path}: expected results of `mint-hub evaluate`, got no file") from None
+    except ValueError as error:
+        raise CardError(f"{path}: expected JSON, got {error}") from None
+    if not isinstance(values, dict):
+        raise CardError(f"{path}: expected results of `mint-hub evaluate`, got other JSON")
+    given = cast("dict[str, Any]", values)
+    if given.get("kind") != KIND or given.get("schema") != SCHEMA:
+        raise CardError(f"{path}: expected {KIND}, schema {SCHEMA}, got {given.get('kind')!r}")
+    if lost := [name for name in ("benchmark", "prediction", "rows") if name not in given]:
+        raise CardError(f"{path}: expected {KIND} with {lost[0]}, got none")
+    return given
 
 
 def card_head(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the metadata of the card, with a model-index where there are results."""
     from huggingface_hub import ModelCardData
 
-    evaluated = [entry for result in results for entry in _eval_results(result)]
+    models = [result for result in results if _kind(result) == "checkpoint"]
+    evaluated = [entry for result in models for entry in _eval_results(result)]
     data = ModelCardData(
         language="en",
         license="apache-2.0",
         library_name="transformers",
         pipeline_tag=TASK,
         tags=["egocentric", "hand-pose", "camera-pose", "mint"],
-        model_name=str(results[0]["prediction"]["name"]) if results else None,
+        model_name=str(models[0]["prediction"]["name"]) if models else None,
         eval_results=evaluated or None,
     )
     return data.to_dict()
@@ -131,21 +174,48 @@ def check_model_card(card: str) -> None:
             raise CardError("model-index: expected to read what was written, got other results")
 
 
-def results_section(result: Mapping[str, Any]) -> str:
-    """Return one evaluation as a table, the trivial rows with it."""
-    benchmark, prediction = result["benchmark"], result["prediction"]
-    rows: list[tuple[str, ...]] = []
-    for row in result["rows"]:
-        cells = [_text(_value(row, *place[:3]), place[3]) for place in SHOWN]
-        name = f"**{row['name']}**" if row["row"] == "prediction" else str(row["name"])
-        rows.append((name, *cells))
-    heads = ("", *(f"{name} ({unit})" if unit else name for _, _, name, unit in SHOWN))
-    about = (
+def results_sections(results: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a table for each set of clips that something was evaluated on."""
+    by_clips: dict[str, list[Mapping[str, Any]]] = {}
+    for result in results:
+        by_clips.setdefault(str(result["benchmark"]["hash"]), []).append(result)
+    sections = [_section(group) for group in by_clips.values()]
+    unknown = not any(_kind(result) == "checkpoint" for result in results)
+    return [NO_RESULTS, *sections] if unknown else sections
+
+
+def _section(results: Sequence[Mapping[str, Any]]) -> str:
+    """Return the evaluations of the same clips as one table, a column each."""
+    columns: list[tuple[str, Mapping[str, Any]]] = []
+    about: list[str] = []
+    for result in results:
+        own = [row for row in result["rows"] if row["row"] == "prediction"]
+        columns += [(f"**{row['name']}**", row) for row in own]
+        about += [f"**{row['name']}**: {_facts(result)}." for row in own]
+    columns += [(str(r["name"]), r) for r in results[-1]["rows"] if r["row"] != "prediction"]
+    rows = [
+        (measure_of(place[2]).title, *(_text(row, *place) for _, row in columns)) for place in SHOWN
+    ]
+    benchmark, last = results[-1]["benchmark"], results[-1]
+    about.append(
         f"{benchmark['clips']} clips, {benchmark['frames']} frames, hash {benchmark['hash']}; "
-        f"weights {prediction['weights']}, mint-hub {result['mint_hub']}, {result['date'][:10]}. "
-        f"Mean hand: of {result['trained_on']}."
+        f"mint-hub {last['mint_hub']}, {last['date'][:10]}. In brackets: 95 % of a bootstrap over "
+        f"clips. Mean hand: of {last['trained_on']}."
     )
-    return f"### {benchmark['title']}\n\n{about}\n\n{markdown_table(heads, rows)}"
+    table = markdown_table(("", *(name for name, _ in columns)), rows)
+    return f"### {benchmark['title']}\n\n{' '.join(about)}\n\n{table}"
+
+
+def _facts(result: Mapping[str, Any]) -> str:
+    prediction, date = result["prediction"], result["date"][:10]
+    if prediction["kind"] == "checkpoint":
+        return f"weights {prediction['weights']}, mint-hub {result['mint_hub']}, {date}"
+    return f"labels, not a model of this repository, mint-hub {result['mint_hub']}, {date}"
+
+
+def _kind(result: Mapping[str, Any]) -> str | None:
+    """Return "checkpoint" or "labels"; None where only the rows without a model were asked for."""
+    return result["prediction"]["kind"] if result["prediction"] else None
 
 
 def _eval_results(result: Mapping[str, Any]) -> list[Any]:
@@ -154,9 +224,9 @@ def _eval_results(result: Mapping[str, Any]) -> list[Any]:
     benchmark = result["benchmark"]
     own = next(row for row in result["rows"] if row["row"] == "prediction")
     made: list[Any] = []
-    for group, part, name, unit in SHOWN:
-        value = _value(own, group, part, name)
-        if value is None:
+    for place in SHOWN:
+        triple, name = _triple(own, *place), place[2]
+        if triple is None:
             continue
         made.append(
             EvalResult(
@@ -167,24 +237,31 @@ def _eval_results(result: Mapping[str, Any]) -> list[Any]:
                 dataset_split=benchmark["split"],
                 dataset_revision=str(benchmark["hash"]),
                 metric_type=name.lower().replace(" ", "_"),
-                metric_name=f"{name} ({unit})" if unit else name,
-                metric_value=round(value, 4),
+                metric_name=measure_of(name).title,
+                metric_value=round(triple[0], 4),
                 verified=False,
             )
         )
     return made
 
 
-def _value(row: Mapping[str, Any], group: str, part: str | None, name: str) -> float | None:
+def _triple(
+    row: Mapping[str, Any], group: str, part: str | None, name: str
+) -> tuple[float, float, float] | None:
+    """A number and its interval (NaN where there is none); None where nothing was counted."""
     found = row[group] if part is None else row[group].get(part, {})
     triple = found.get(name)
-    return None if triple is None or triple[0] is None else float(triple[0])
+    if triple is None or triple[0] is None:
+        return None
+    value, low, high = (math.nan if v is None else float(v) for v in triple)
+    return value, low, high
 
 
-def _text(value: float | None, unit: str) -> str:
-    if value is None:
-        return "—"
-    return f"{value:.3f}" if unit in ("", "m") else f"{value:.2f}"
+def _text(row: Mapping[str, Any], group: str, part: str | None, name: str) -> str:
+    triple, unit = _triple(row, group, part, name), measure_of(name).unit
+    if triple is None:
+        return NOTHING
+    return f"{number(triple[0], unit)} {interval(*triple[1:], unit)}".strip()
 
 
 def _configurations() -> dict[str, str]:

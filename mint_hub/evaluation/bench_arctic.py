@@ -17,7 +17,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final, cast
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,6 +29,7 @@ from mint_hub.evaluation.clips import (
     Image,
     MissingFilesError,
     Source,
+    decoded_picture,
     image_folder_stamp,
 )
 from mint_hub.geometry import hand_state as hands
@@ -240,9 +240,7 @@ class _ArcticFrames(Frames):
         """Yield the rectified pictures."""
         warp: Rectification | None = None
         for path in self.paths:
-            image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-            if image is None:  # pyright: ignore[reportUnnecessaryComparison]
-                raise BenchmarkError(f"{path}: expected a picture, got other bytes; {GET}")
+            image = decoded_picture(path.read_bytes(), str(path), GET)
             size = (image.shape[0], image.shape[1])
             if warp is None or warp.source_size_hw != size:
                 if abs(size[1] * CALIBRATED_HW[0] / (size[0] * CALIBRATED_HW[1]) - 1) > 0.01:
@@ -251,7 +249,7 @@ class _ArcticFrames(Frames):
                         f"{size[1]} x {size[0]}"
                     )
                 warp = rectification(self.camera.lens.resized(size), SIZE_HW, self.camera.K)
-            yield warp.apply(cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8))
+            yield warp.apply(image)
 
     def stamp(self) -> str:
         """Return the files' names, sizes and times as a hash."""

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,6 +26,7 @@ from mint_hub.evaluation.clips import (
     Image,
     MissingFilesError,
     Source,
+    decoded_picture,
     image_folder_stamp,
     knows_hands,
     truth_model,
@@ -141,7 +141,17 @@ def _clip(episode: Episode, frames: Frames | None, source: Source, why: str) -> 
 
 def _read_sequence(folder: Path, source: Source) -> Clip:
     stream = source.stream or ("1201-1" if (folder / "camera_models.json").is_file() else "214-1")
-    raw = from_hot3d(folder, stream, mano_dir=source.mano_dir)
+    try:
+        raw = from_hot3d(folder, stream, mano_dir=source.mano_dir)
+    except FileNotFoundError as error:
+        if "MANO_RIGHT" in str(error):  # not a file of the benchmark
+            raise
+        lost = f"{error.filename}: expected this file, found none" if error.filename else error
+        raise MissingFilesError(f"{lost}; is the download whole? {GET}") from None
+    except ValueError as error:
+        if str(folder) not in str(error):
+            raise
+        raise BenchmarkError(f"{error}; is the download whole? {GET}") from None
     first = int(raw.meta["provenance"]["first_timestamp_ns"])
     stamps = first + np.round(raw.timestamps_s * 1e9).astype(np.int64)
     upright = Upright.of(
@@ -181,7 +191,7 @@ class _StampedFrames(Frames):
     def images(self) -> Iterator[Image]:
         """Yield the upright pictures."""
         for path in self.paths:
-            yield self.upright.apply(_decoded(path.read_bytes(), str(path)))
+            yield self.upright.apply(decoded_picture(path.read_bytes(), str(path), GET))
 
     def stamp(self) -> str:
         """Return the files' names, sizes and times as a hash."""
@@ -311,7 +321,9 @@ class _TarFrames(Frames):
         """Yield the upright pictures."""
         with _opened(self.path) as tar:
             for name in self.names:
-                yield self.upright.apply(_decoded(_member(tar, name, self.path), name))
+                yield self.upright.apply(
+                    decoded_picture(_member(tar, name, self.path), f"{self.path}: {name}", GET)
+                )
 
     def stamp(self) -> str:
         """Return the file's name, size and time as a hash."""
@@ -343,10 +355,3 @@ def _json(tar: tarfile.TarFile, name: str, path: Path) -> Any:
         return json.loads(_member(tar, name, path))
     except ValueError as error:
         raise BenchmarkError(f"{path}: {name}: expected JSON, got {error}") from None
-
-
-def _decoded(data: bytes, name: str) -> Image:
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    if image is None:  # pyright: ignore[reportUnnecessaryComparison]
-        raise BenchmarkError(f"{name}: expected a picture, got {len(data)} other bytes")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -263,6 +264,21 @@ def knows_hands(episode: Episode) -> bool:
     quality = episode.meta.get("quality")
     words = quality.get("hands") if isinstance(quality, dict) else None
     return not str(words or "").startswith("unavailable")
+
+
+def decoded_picture(data: bytes, name: str, advice: str) -> Image:
+    """Decode a JPEG or PNG file to (H, W, 3) RGB.
+
+    Raises:
+        BenchmarkError: it is none; names it and gives the advice.
+
+    """
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    if image is None:
+        raise BenchmarkError(
+            f"{name}: expected a picture, got {len(data)} bytes that are none; {advice}"
+        )
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8)
 
 
 def image_folder_stamp(paths: Sequence[Path]) -> str:

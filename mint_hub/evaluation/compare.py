@@ -20,18 +20,24 @@ from mint_hub.evaluation.results import (
     ClipResult,
     Results,
     ResultsError,
+    drawn_metrics,
     percentiles,
     resamples,
     totalled,
 )
 from mint_hub.evaluation.scoring import Score
-from mint_hub.evaluation.tables import measure_of, number
 from mint_hub.geometry.metrics import (
+    FIELD_OF_VIEW,
     HAND_MEASURES,
+    NOTHING,
     TRAJECTORY_MEASURES,
     WORLD_MEASURES,
     HandStatistics,
     WorldStatistics,
+    interval,
+    measure_of,
+    none_for_nan,
+    number,
 )
 from mint_hub.loaders.atomic import replacing
 from mint_hub.loaders.derived import markdown_table
@@ -90,14 +96,20 @@ class Comparison:
             f"{lost if self.only_a or self.only_b else ''}. B - A with the 95 % interval of a "
             "bootstrap over clips; p of Wilcoxon's signed-rank test over clips, Holm-corrected."
         )
+        tested = sum(not isnan(d.p) for d in self.differences)
+        if 2 * tested * 0.5**self.clips > LEVEL:
+            about += (
+                f" With {self.clips} clips and {tested} numbers no p can be below {LEVEL:g}, so "
+                "nothing is called better: read the intervals."
+            )
         rows = [
             (
-                f"{d.name} ({d.unit})" if d.unit else d.name,
+                measure_of(d.name).title,
                 number(d.a, d.unit),
                 number(d.b, d.unit),
-                f"{number(d.b - d.a, d.unit)} [{number(d.low, d.unit)}, {number(d.high, d.unit)}]",
-                "—" if isnan(d.p_holm) else f"{d.p_holm:.2g}",
-                d.better or "—",
+                f"{number(d.b - d.a, d.unit)} {interval(d.low, d.high, d.unit)}".strip(),
+                NOTHING if isnan(d.p_holm) else f"{d.p_holm:.2g}",
+                d.better or NOTHING,
             )
             for d in self.differences
         ]
@@ -106,11 +118,7 @@ class Comparison:
 
     def save(self, path: Path) -> Path:
         """Write it as JSON (None for NaN), whole or not at all."""
-        values: dict[str, Any] = {"kind": "mint-hub comparison", "schema": 1, **asdict(self)}
-        for difference in values["differences"]:
-            for key, value in difference.items():
-                if isinstance(value, float) and isnan(value):
-                    difference[key] = None
+        values = {"kind": "mint-hub comparison", "schema": 1, **none_for_nan(asdict(self))}
         with replacing(path) as temporary:
             temporary.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
         return path
@@ -125,7 +133,8 @@ def compare(a: Results, b: Results, row: str = "prediction") -> Comparison:
         row: which row of both.
 
     Raises:
-        ResultsError: no clip in common, another truth under the same key, or no such row.
+        ResultsError: no clip in common, another truth or other pictures under the same key, or no
+            such row.
 
     """
     for name, results in (("A", a), ("B", b)):
@@ -143,6 +152,12 @@ def compare(a: Results, b: Results, row: str = "prediction") -> Comparison:
             raise ResultsError(
                 f"{key}: expected the same frames, got {mine[key].frames} in A and "
                 f"{theirs[key].frames} in B"
+            )
+        if mine[key].stamp != theirs[key].stamp:
+            raise ResultsError(
+                f"{key}: expected the same truth, pictures and hand on both sides, got others "
+                f"(hash {mine[key].stamp} in A, {theirs[key].stamp} in B): evaluate both on one "
+                "benchmark"
             )
     pairs = [(_score(mine[key], row), _score(theirs[key], row)) for key in shared]
     return Comparison(
@@ -174,7 +189,7 @@ def _differences(pairs: Sequence[tuple[Score, Score]]) -> list[Difference]:
     world = [[s.world.get("SE(3)", WorldStatistics()) for s in side] for side in both]
     found += _pooled([m.name for m in WORLD_MEASURES], world, WorldStatistics, draws)
     columns = [np.array([s.fov_error_deg for s in side]) for side in both]
-    found.append(_mean("field of view error", columns, draws))
+    found.append(_mean(FIELD_OF_VIEW.name, columns, draws))
     return [d for d in found if not isnan(d.a) and not isnan(d.b)]
 
 
@@ -186,15 +201,9 @@ def _pooled(
     names: Sequence[str], sides: Sequence[Sequence[Any]], kind: Any, draws: NDArray[np.int64]
 ) -> list[Difference]:
     """Differences of numbers that are made of sums."""
-    fields = list(kind().to_dict())
     values: list[dict[str, float]] = [totalled(side, kind).metrics() for side in sides]
     by_clip: list[list[dict[str, float]]] = [[part.metrics() for part in side] for side in sides]
-    drawn: list[list[dict[str, float]]] = []
-    for side in sides:
-        table = np.array([[part.to_dict()[f] for f in fields] for part in side], float)
-        sums = table[draws].sum(axis=1) if len(draws) else np.zeros((0, len(fields)))
-        rows = (kind(**dict(zip(fields, row, strict=True))) for row in sums.tolist())
-        drawn.append([row.metrics() for row in rows])
+    drawn = [drawn_metrics(side, kind, draws) for side in sides]
     made: list[Difference] = []
     for name in names:
         columns = [np.array([metrics[name] for metrics in side]) for side in by_clip]
@@ -209,7 +218,7 @@ def _mean(
 ) -> Difference:
     known = np.isfinite(columns[0]) & np.isfinite(columns[1])
     both = [np.where(known, column, nan) for column in columns]
-    unit = measure_of(label).unit or ("deg" if "field of view" in label else "")
+    unit = measure_of(label).unit
     if not known.any():
         return Difference(label, unit, nan, nan, nan, nan, 0, nan, nan, "")
     rows = draws[known[draws].any(axis=1)] if len(draws) else draws
@@ -244,9 +253,7 @@ def _ranked(differences: Sequence[Difference]) -> list[Difference]:
     made: list[Difference] = []
     for i, d in enumerate(differences):
         p = corrected.get(i, nan)
-        ideal = measure_of(d.name).ideal
-        ideal = 0.0 if "field of view" in d.name else ideal
-        better = ""
+        ideal, better = measure_of(d.name).ideal, ""
         seen = number(d.a, d.unit) != number(d.b, d.unit)  # no verdict on rounding
         if seen and ideal is not None and p < LEVEL and (d.low > 0 or d.high < 0):
             better = "B" if abs(d.b - ideal) < abs(d.a - ideal) else "A"

@@ -22,6 +22,7 @@ from mint_hub.evaluation.predictor import OpenPredictor, Predictor
 from mint_hub.evaluation.results import ClipResult, Results, efficiency_of
 from mint_hub.evaluation.scoring import ClipScorer, Score
 from mint_hub.evaluation.trivial import MeanHand, trivial_predictions
+from mint_hub.geometry.trajectory_metrics import DEGENERATE_PATH_M
 from mint_hub.loaders.parallel import in_order
 from mint_hub.view.canvas import plural
 
@@ -67,7 +68,7 @@ class _Scorer:
                 raise
             seconds, peak = made.seconds, made.peak_bytes
             scores["prediction"] = scorer.score(made.episode)
-        for row, episode in trivial_predictions(clip.truth, self.mean).items():
+        for row, episode in trivial_predictions(clip.truth, self.mean, scorer.seen()).items():
             scores[row] = scorer.score(episode, row)
         frames = clip.truth.num_frames
         return ClipResult(clip.key, frames, clip.source, clip.stamp(), scores, seconds, peak)
@@ -147,16 +148,21 @@ def _warnings(clips: tuple[ClipResult, ...], skipped: tuple[str, ...]) -> Iterab
         yield f"{count} without a prediction, which count nowhere, the first: {skipped[0]}"
     row = next(iter(clips[0].scores))
     scored = [clip.scores[row].hands.get("published") for clip in clips]
-    known = [hands for hands in scored if hands is not None]
-    if not known:
+    seen = [hands for hands in scored if hands is not None]
+    if not seen:
         yield "the truth has no hands that can be read: there are no hand numbers"
-    elif not any(hands.pose_count for hands in known):
+    elif not any(hands.pose_count for hands in seen):
         yield "no hand is on screen in any clip: pose numbers are empty"
-    still = sum(_degenerate(clip) for clip in clips)
+    cameras = [
+        clip.scores[row].camera or clip.scores["zero camera motion"].camera for clip in clips
+    ]
+    known = [camera for camera in cameras if camera is not None]
+    still = sum(camera.true_path_m < DEGENERATE_PATH_M for camera in known)
     if still:
         yield f"{plural(still, 'clip')} whose camera does not move: reported, not ranked"
-
-
-def _degenerate(clip: ClipResult) -> bool:
-    camera = clip.scores["last frame copied"].camera
-    return camera is not None and camera.true_path_m < 1e-9
+    stuck = sum(c.degenerate for c in known) - still
+    if row == "prediction" and stuck:
+        yield (
+            f"{plural(stuck, 'clip')} whose predicted camera does not move though the true one "
+            "does: left out of the camera's numbers, unless there are no others"
+        )

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from mint_hub.evaluation.clips import Clip
 from mint_hub.evaluation.results import Results
+from mint_hub.evaluation.scoring import model_for
 from mint_hub.geometry import rigid
+from mint_hub.geometry.hand_model import HandModel
 from mint_hub.geometry.metrics import align_paths
 from mint_hub.loaders.schema import Episode
 from mint_hub.view import canvas
@@ -148,11 +150,16 @@ def worst_frame(clip: Clip, predicted: Episode) -> int:
 
 
 def pair_figure(
-    clip: Clip, predicted: Episode, frame: int, picture: Image | None, height: int = 330
+    clip: Clip,
+    predicted: Episode,
+    frame: int,
+    picture: Image | None,
+    hand_model: HandModel | None = None,
+    height: int = 330,
 ) -> Image:
     """Draw the truth (left) and the prediction (right) over a frame; on grey without a picture.
 
-    Both through the true camera, as they are scored.
+    Both through the true camera and with the hands that they are scored with.
     """
     rows, columns = clip.image_size_hw
     blank = canvas.blank(rows, columns, DARK)
@@ -166,7 +173,7 @@ def pair_figure(
     )
     sides = [
         draw_overlay(shown, truth, frame, clip.hand_model),
-        draw_overlay(shown, guess, frame),
+        draw_overlay(shown, guess, frame, model_for(predicted, clip, hand_model)),
     ]
     width = round(columns * height / rows)
     small = [cv2.resize(i, (width, height), interpolation=cv2.INTER_AREA) for i in sides]

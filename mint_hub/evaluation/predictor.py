@@ -206,9 +206,12 @@ class OpenCheckpoint(OpenPredictor):
     def predict(self, clip: Clip) -> Prediction:
         """Run the model on a clip, or read what it said before."""
         if clip.frames is None:
-            raise MissingFilesError(
-                f"{clip.key}: no pictures to run a model on: {clip.without_frames}"
-            )
+            words = f"no pictures to run {self._spec.what} on: {clip.without_frames}"
+            if not Path(self._spec.what).expanduser().is_dir():
+                words += (
+                    f" (there is no folder {self._spec.what}: it is taken for a hub repository)"
+                )
+            raise MissingFilesError(f"{clip.key}: {words}")
         path = self._cached(clip)
         if path is not None and path.is_file():
             return Prediction(Episode.load(path))

@@ -18,12 +18,11 @@ from mint_hub.evaluation.tables import (
     Table,
     all_tables,
     efficiency_line,
-    measure_of,
-    number,
     published,
     write_markdown,
 )
 from mint_hub.evaluation.trivial import MeanHand, trivial_predictions
+from mint_hub.geometry.metrics import measure_of, number
 from mint_hub.loaders.atomic import replacing
 from mint_hub.loaders.schema import Episode
 from mint_hub.view import canvas
@@ -79,9 +78,16 @@ STYLE: Final = """<style>
 .plots .plot { margin: 0; }
 .worst { margin: 0 0 26px; }
 .worst h3 { margin: 0 0 2px; font-size: 15px; overflow-wrap: anywhere; }
-.worst .row { display: grid; grid-template-columns: minmax(0, 2.6fr) minmax(0, 1fr); gap: 12px;
-  align-items: start; margin-top: 8px; }
-@media (max-width: 700px) { .plots, .worst .row { grid-template-columns: 1fr; } }
+.worst .note { max-width: none; }
+.worst .row { display: grid; grid-template-columns: minmax(0, 3.2fr) minmax(0, 1fr); gap: 12px;
+  margin-top: 8px; }
+.worst figure { margin: 0; }
+.worst .path { display: flex; align-items: center; border-radius: 10px;
+  background: rgb(243, 245, 247); }
+@media (max-width: 700px) {
+  .plots, .worst .row { grid-template-columns: 1fr; }
+  .tiles { grid-template-columns: 1fr 1fr; }
+}
 </style>"""
 
 
@@ -182,7 +188,8 @@ def _worst(
         picture = None
         if clip.frames is not None:
             picture = next(islice(clip.frames.images(), frame, None), None)
-        pair = pair_figure(clip, predicted, frame, picture)
+        model = None if opened is None else opened.hand_model
+        pair = pair_figure(clip, predicted, frame, picture, model)
         yield _Worst(result, clip, frame, pair, path_figure(clip, predicted))
 
 
@@ -207,7 +214,7 @@ def _worst_section(results: Results, shown: Sequence[_Worst]) -> str:
             f'<div class="worst"><h3>{html.escape(item.clip.key)}</h3>'
             f'<p class="note">{html.escape(" · ".join(numbers))} · frame {item.frame} at '
             f'{time:.2f} s, the worst of it</p><div class="row">'
-            f"<figure>{pair}</figure><figure>{path}</figure></div></div>"
+            f'<figure>{pair}</figure><figure class="path">{path}</figure></div></div>'
         )
     who = html.escape(_who(results) if results.prediction else "always present")
     return (
@@ -278,10 +285,11 @@ def _triple(
 
 
 def _warnings(results: Results) -> str:
-    notes = [*results.benchmark["notes"], f"the mean hand is of {results.trained_on}"]
+    notes = [*results.benchmark["notes"], f"mean hand: of {results.trained_on}"]
+    words = ". ".join(note[:1].upper() + note[1:] for note in notes)
     items = "".join(f"<li>{html.escape(text)}</li>" for text in results.warnings)
     warn = f'<section class="warn"><h2>Warnings</h2><ul>{items}</ul></section>' if items else ""
-    return f'{warn}<section><p class="note">{html.escape("; ".join(notes))}.</p></section>'
+    return f'{warn}<section><p class="note">{html.escape(words)}.</p></section>'
 
 
 def _figures(results: Results) -> Iterable[tuple[str, Image]]:

@@ -18,9 +18,8 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import isnan
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +30,7 @@ from mint_hub.geometry.metrics import (
     HandStatistics,
     TrajectoryStatistics,
     WorldStatistics,
+    none_for_nan,
 )
 from mint_hub.loaders.atomic import replacing
 
@@ -115,7 +115,7 @@ class Results:
     def to_dict(self) -> dict[str, Any]:
         """Return what the file holds."""
         rows = [
-            {"row": row, "name": self.title(row), **cast("dict[str, Any]", _plain(numbers))}
+            {"row": row, "name": self.title(row), **none_for_nan(numbers)}
             for row, numbers in self.summary.items()
         ]
         return {
@@ -218,12 +218,18 @@ def resamples(count: int) -> NDArray[np.int64]:
 
 def pooled(parts: Sequence[Any], kind: Any, draws: NDArray[np.int64]) -> dict[str, Triple]:
     """Metrics of the sum of statistics, and their intervals over resampled clips."""
+    value, drawn = totalled(parts, kind).metrics(), drawn_metrics(parts, kind, draws)
+    return {name: (value[name], *percentiles(np.array([d[name] for d in drawn]))) for name in value}
+
+
+def drawn_metrics(
+    parts: Sequence[Any], kind: Any, draws: NDArray[np.int64]
+) -> list[dict[str, float]]:
+    """Metrics of the sum of statistics, for each draw of clips (N, clips)."""
     names = list(kind().to_dict())
     table = np.array([[part.to_dict()[name] for name in names] for part in parts], float)
-    value = totalled(parts, kind).metrics()
     sums = table[draws].sum(axis=1) if len(draws) else np.zeros((0, len(names)))
-    drawn = [kind(**dict(zip(names, row, strict=True))).metrics() for row in sums.tolist()]
-    return {name: (value[name], *percentiles(np.array([d[name] for d in drawn]))) for name in value}
+    return [kind(**dict(zip(names, row, strict=True))).metrics() for row in sums.tolist()]
 
 
 def totalled(parts: Sequence[Any], kind: Any) -> Any:
@@ -295,15 +301,3 @@ def efficiency_of(
         "dtype": prediction.get("dtype"),
         **{name: settings.get(name) for name in ("window", "overlap", "batch_size", "smooth")},
     }
-
-
-def _plain(value: Any) -> Any:
-    """JSON values: None for NaN, lists for tuples."""
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in cast("dict[str, Any]", value).items()}
-    if isinstance(value, tuple | list):
-        return [_plain(v) for v in cast("Sequence[Any]", value)]
-    if isinstance(value, float) and not np.isfinite(value):
-        assert isnan(value), value
-        return None
-    return value

@@ -11,7 +11,7 @@ length mistakes depth with it:
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import isnan, nan
+from math import nan
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from mint_hub.evaluation.clips import Clip
 from mint_hub.evaluation.strata import strata_of
 from mint_hub.geometry.camera import K_to_fov_vh
-from mint_hub.geometry.hand_model import HandModel
+from mint_hub.geometry.hand_model import HandModel, ShapeSpace
 from mint_hub.geometry.hand_state import unpack
 from mint_hub.geometry.metrics import (
     Hands,
@@ -30,6 +30,8 @@ from mint_hub.geometry.metrics import (
     WorldStatistics,
     canonical_joints,
     hand_statistics,
+    none_for_nan,
+    present_hands,
     trajectory_errors,
     world_hand_statistics,
 )
@@ -71,7 +73,7 @@ class Score:
             "camera": None if self.camera is None else self.camera.to_dict(),
             "world": {k: v.to_dict() for k, v in self.world.items()},
             "strata": {k: v.to_dict() for k, v in self.strata.items()},
-            "fov_error_deg": None if isnan(self.fov_error_deg) else self.fov_error_deg,
+            "fov_error_deg": none_for_nan(self.fov_error_deg),
         }
 
     @classmethod
@@ -136,26 +138,21 @@ class ClipScorer:
             raise ValueError(f"{clip.key}, {row}: {error}") from None
         return Score(by_reading, camera, world, strata, float(fov_error))
 
+    def seen(self) -> NDArray[np.bool_]:
+        """Which true hands are on screen, (T, 2); none where the truth does not know hands."""
+        if not self.clip.hands:
+            return np.zeros((self.clip.truth.num_frames, 2), bool)
+        return present_hands(self._truth, self.clip.K, self.clip.image_size_hw)
+
     # ------------------------------------------------------------------ parts
 
     def _hands(self, predicted: Episode) -> Hands:
-        state = predicted.hand_state.astype(np.float64)
-        return Hands.from_state(state, predicted.presence, self._model(predicted))
-
-    def _model(self, predicted: Episode) -> HandModel:
-        """The truth's own hand where shape numbers mean the same to it."""
-        space = predicted.meta.get("shape_space", "mint")
-        for model in (self.hand_model, self.clip.hand_model):
-            if model is not None and model.shape_space == space:
-                return model
-        return HandModel.template()
+        return _hands_of(predicted, model_for(predicted, self.clip, self.hand_model))
 
     @property
     def _truth(self) -> Hands:
         if "truth" not in self._once:
-            truth = self.clip.truth
-            state = truth.hand_state.astype(np.float64)
-            self._once["truth"] = Hands.from_state(state, truth.presence, self.clip.hand_model)
+            self._once["truth"] = _hands_of(self.clip.truth, self.clip.hand_model)
             self._once["canonical"] = canonical_joints(self.clip.hand_model)
         return self._once["truth"]
 
@@ -202,6 +199,27 @@ class ClipScorer:
             name: world_hand_statistics(side, true, truth.fps, with_scale=name == "Sim(3)")
             for name, side in sides.items()
         }
+
+
+def model_for(predicted: Episode, clip: Clip, given: HandModel | None = None) -> HandModel:
+    """Return the hand that a prediction's joints are made with.
+
+    The given one, or else the truth's own, where the prediction's shape numbers mean something to
+    it; else the template, with its mean shape.
+    """
+    for model in (given, clip.hand_model):
+        if model is not None and model.shape_space == _shape_space(predicted):
+            return model
+    return HandModel.template()
+
+
+def _shape_space(episode: Episode) -> ShapeSpace:
+    return episode.meta.get("shape_space", "mint")
+
+
+def _hands_of(episode: Episode, model: HandModel) -> Hands:
+    state = episode.hand_state.astype(np.float64)
+    return Hands.from_state(state, episode.presence, model, _shape_space(episode))
 
 
 def _intrinsics(predicted: Episode, image_size_hw: tuple[int, int]) -> NDArray[np.float64]:

@@ -60,6 +60,7 @@ def _binned(
     for low, high in pairwise(edges):
         inside = (values >= low) & (values < high)
         if inside.any():
-            end = "and more" if np.isinf(high) else f"to {high:.{digits}f}"
-            found[f"{name}: {low:.{digits}f} {end} {unit}".strip()] = inside
+            bounds = [f"{low:.{digits}f}"] + [f"to {high:.{digits}f}"] * (not np.isinf(high))
+            words = [*bounds, unit, "and more" if np.isinf(high) else ""]
+            found[f"{name}: {' '.join(filter(None, words))}"] = inside
     return found

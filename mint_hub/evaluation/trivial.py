@@ -87,14 +87,16 @@ class MeanHand:
         """Read what ``save`` wrote; without a path, what comes with mint-hub.
 
         Raises:
-            ValueError: not such a file.
+            ValueError: no such file, or not a mean hand.
 
         """
-        data = read_asset(MEAN_HAND_FILE) if path is None else path.read_bytes()
         try:
+            data = read_asset(MEAN_HAND_FILE) if path is None else path.read_bytes()
             made = cls(**json.loads(data))
             made.state()
             return made
+        except FileNotFoundError:
+            raise ValueError(f"{path}: expected a mean hand, found no file") from None
         except (TypeError, ValueError) as error:
             raise ValueError(
                 f"{path or MEAN_HAND_FILE}: expected a mean hand, got {error}"
@@ -114,8 +116,18 @@ class MeanHand:
         return state
 
 
-def trivial_predictions(truth: Episode, mean: MeanHand) -> dict[str, Episode]:
-    """Return the answers of TRIVIAL for a clip, as episodes."""
+def trivial_predictions(
+    truth: Episode, mean: MeanHand, seen: NDArray[np.bool_] | None = None
+) -> dict[str, Episode]:
+    """Return the answers of TRIVIAL for a clip, as episodes.
+
+    Args:
+        truth: the clip's.
+        mean: hands of the training set.
+        seen: (T, 2) which true hands can be seen, for the last frame copied; the truth's presence
+            without it. They differ where the truth knows hands off screen, as motion capture does.
+
+    """
     count = truth.num_frames
     seed = int.from_bytes(hashlib.sha256(truth.key.encode()).digest()[:8], "little")
     by_lot = np.random.default_rng(seed).random((count, 2)) < mean.presence_rate
@@ -125,7 +137,7 @@ def trivial_predictions(truth: Episode, mean: MeanHand) -> dict[str, Episode]:
         "mean hand": _constant(truth, mean, by_lot, still),
         "always present": always,
         "zero camera motion": always,
-        "last frame copied": _late(truth),
+        "last frame copied": _late(truth, truth.presence if seen is None else seen),
     }
 
 
@@ -150,15 +162,17 @@ def _constant(
     )
 
 
-def _late(truth: Episode) -> Episode:
+def _late(truth: Episode, seen: NDArray[np.bool_]) -> Episode:
     """The truth of the frame before; the first frame has its own."""
     before = np.maximum(np.arange(truth.num_frames) - 1, 0)
+    there = seen[before]
+    state = np.where(there[..., None], truth.hand_state[before], hands.absent(there.shape))
     return replace(
         truth,
         T_camera_from_world=truth.T_camera_from_world[before],
         fov_vh_rad=truth.fov_vh_rad[before],
-        hand_state=truth.hand_state[before],
-        presence=truth.presence[before],
+        hand_state=state.astype(np.float32),
+        presence=there,
         presence_score=None,
         filled=None,
         text=(),

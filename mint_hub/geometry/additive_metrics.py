@@ -6,8 +6,8 @@ Every process sums the clips it was given; the corpus's statistics are the sum o
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from math import nan
-from typing import Any, Self
+from math import isnan, nan
+from typing import Any, Final, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,19 @@ from mint_hub.geometry.rotations import nearest_rotation
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+
+DIGITS: Final = {
+    "": 3,
+    "mm": 2,
+    "px": 1,
+    "deg": 2,
+    "m": 3,
+    "mm/frame^2": 2,
+    "% of path": 2,
+    "m/s^2": 2,
+}
+"""How many decimals of a number people are shown, by unit."""
+NOTHING: Final = "—"
 
 
 @dataclass(frozen=True)
@@ -32,6 +45,29 @@ class Measure:
     name: str
     unit: str
     ideal: float | None
+
+    @property
+    def title(self) -> str:
+        """Name, with the unit in brackets where there is one."""
+        return f"{self.name} ({self.unit})" if self.unit else self.name
+
+
+def number(value: float, unit: str) -> str:
+    """Print a number with the decimals of its unit.
+
+    >>> number(29.9264, "mm"), number(-1e-9, "mm"), number(float("nan"), "mm")
+    ('29.93', '0.00', '—')
+    """
+    return NOTHING if isnan(value) else f"{value:z.{DIGITS.get(unit, 3)}f}"
+
+
+def interval(low: float, high: float, unit: str) -> str:
+    """Print an interval, or nothing where there is none.
+
+    >>> interval(1.0, 2.5, "m"), interval(float("nan"), 2.5, "m")
+    ('[1.000, 2.500]', '')
+    """
+    return "" if isnan(low) or isnan(high) else f"[{number(low, unit)}, {number(high, unit)}]"
 
 
 @dataclass(frozen=True)
@@ -79,6 +115,31 @@ def require_fields(kind: Any, values: Mapping[str, Any]) -> None:
 def ratio(total: float, count: float) -> float:
     """``total / count``, and NaN where nothing was counted."""
     return total / count if count else nan
+
+
+def none_for_nan(value: Any) -> Any:
+    """Return what JSON holds: None for NaN, lists for tuples, however deep.
+
+    >>> none_for_nan({"a": (1.0, float("nan"))})
+    {'a': [1.0, None]}
+    """
+    if isinstance(value, dict):
+        return {k: none_for_nan(v) for k, v in cast("dict[str, Any]", value).items()}
+    if isinstance(value, tuple | list):
+        return [none_for_nan(v) for v in cast("list[Any]", value)]
+    return None if isinstance(value, float) and isnan(value) else value
+
+
+def checked_fps(fps: float) -> float:
+    """``fps``, frames a second.
+
+    Raises:
+        ValueError: it is not positive, or not finite.
+
+    """
+    if not 0 < fps < float("inf"):
+        raise ValueError(f"fps: expected a positive number, got {fps}")
+    return fps
 
 
 def checked_floats(name: str, values: Any, shape: tuple[int, ...]) -> Floats:

@@ -27,7 +27,7 @@ from mint_hub.geometry.additive_metrics import (
     ratio,
 )
 from mint_hub.geometry.camera import MIN_DEPTH_M, on_screen, project, require_image_size
-from mint_hub.geometry.hand_model import HandModel
+from mint_hub.geometry.hand_model import HandModel, ShapeSpace
 from mint_hub.geometry.hand_state import absent, unpack
 from mint_hub.geometry.rigid import umeyama
 from mint_hub.geometry.rotations import geodesic_angle
@@ -67,8 +67,16 @@ class Hands:
     present: Any
 
     @classmethod
-    def from_state(cls, hand_state: Any, present: Any, model: HandModel | None = None) -> "Hands":
+    def from_state(
+        cls,
+        hand_state: Any,
+        present: Any,
+        model: HandModel | None = None,
+        shape_space: ShapeSpace | None = None,
+    ) -> "Hands":
         """Hands of states (T, 2, 109); those not present may hold anything.
+
+        Shape numbers of another ``shape_space`` than the model's are replaced by its mean shape.
 
         Raises:
             ValueError: wrong shapes, or a degenerate rotation in a hand that is present.
@@ -78,7 +86,7 @@ class Hands:
         given = np.asarray(hand_state, dtype=np.float64)
         state = np.where(flags[..., None], given, absent((), like=given))
         hand = unpack(state)
-        joints = (model or HandModel.default()).keypoints(state)
+        joints = (model or HandModel.default()).keypoints(state, shape_space)
         return cls(joints, hand.orientation(), hand.translation, flags)
 
 
@@ -205,9 +213,8 @@ def hand_statistics(
         np.ones((frames, 2), bool) if only is None else checked_flags("only", only, (frames, 2))
     )
 
-    pixels, _ = project(_in_front(true.joints), K_true)
-    visible = true.present[..., None] & on_screen(pixels, true.joints[..., 2], size_hw)
-    present = visible.any(axis=-1)
+    pixels, visible = _seen(true, K_true, size_hw)
+    present = np.asarray(visible.any(axis=-1))
     frame, hand = np.nonzero(present & counted)
     missed = ~guess.present[frame, hand]
     guess_pixels, _ = project(_in_front(guess.joints), K_guess)
@@ -222,6 +229,30 @@ def hand_statistics(
         + _shape_sums(guess.joints[frame, hand], true.joints[frame, hand], stand_in[hand], missed)
         + _wrist_sums(guess, true, frame, hand, missed)
     )
+
+
+def present_hands(truth: Hands, K: Any, image_size_hw: tuple[int, int]) -> Bools:
+    """Which true hands are present: valid, with a joint on screen; (T, 2).
+
+    Args:
+        truth: T frames; ``present`` is whether the truth is valid.
+        K: (3, 3) or (T, 3, 3) pixels.
+        image_size_hw: (height, width) pixels.
+
+    Raises:
+        ValueError: as ``hand_statistics`` does.
+
+    """
+    frames = len(np.asarray(truth.present))
+    true, size_hw = _checked("truth", truth, frames), require_image_size(image_size_hw)
+    return np.asarray(_seen(true, _intrinsics("K", K, frames), size_hw)[1].any(axis=-1))
+
+
+def _seen(true: Hands, K: Floats, image_size_hw: tuple[int, int]) -> tuple[Floats, Bools]:
+    """Pixels (T, 2, 21, 2) of joints, and which joints are on screen."""
+    pixels, _ = project(_in_front(true.joints), K)
+    visible = np.asarray(on_screen(pixels, true.joints[..., 2], image_size_hw))
+    return pixels, np.asarray(visible & true.present[..., None])
 
 
 def _checked(name: str, hands: Hands, frames: int) -> Hands:

@@ -18,7 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mint_hub.conventions import MODEL_FPS
-from mint_hub.geometry.additive_metrics import Floats, Measure, checked_path, require_fields
+from mint_hub.geometry.additive_metrics import (
+    Floats,
+    Measure,
+    checked_fps,
+    checked_path,
+    none_for_nan,
+    require_fields,
+)
 from mint_hub.geometry.rigid import Similarity, inverse, umeyama
 from mint_hub.geometry.rotations import geodesic_angle
 
@@ -124,7 +131,7 @@ class TrajectoryErrors:
 
     def to_dict(self) -> dict[str, Any]:
         """Return nested fields ready for JSON, None for NaN."""
-        return _none_for_nan(asdict(self))
+        return none_for_nan(asdict(self))
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "TrajectoryErrors":
@@ -198,9 +205,7 @@ def trajectory_errors(predicted: Any, truth: Any, fps: float = MODEL_FPS) -> Tra
     """
     G = checked_path("truth", truth)
     P = checked_path("predicted", predicted, len(G))
-    if not 0 < fps < float("inf"):
-        raise ValueError(f"fps: expected a positive number, got {fps}")
-    second = max(1, round(fps))
+    second = max(1, round(checked_fps(fps)))
     true_path, path = path_length(G), path_length(P)
     degenerate = min(true_path, path) < DEGENERATE_PATH_M
     scale = nan if degenerate else float(align_paths(P, G, with_scale=True).scale)
@@ -327,12 +332,3 @@ def _log_scale(centres: Floats, true_centres: Floats, step: int) -> float:
 def _rmse_mm(errors_m: Floats) -> float:
     """Root of the mean squared length of vectors (..., 3), metres, in mm."""
     return 1e3 * float(np.sqrt(np.square(errors_m).sum(axis=-1).mean()))
-
-
-def _none_for_nan(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        key: _none_for_nan(value)
-        if isinstance(value, dict)
-        else (None if isinstance(value, float) and isnan(value) else value)
-        for key, value in values.items()
-    }

@@ -22,6 +22,7 @@ from mint_hub.geometry.additive_metrics import (
     Measure,
     checked_flags,
     checked_floats,
+    checked_fps,
     checked_path,
     finite_where,
     ratio,
@@ -114,8 +115,7 @@ def world_hand_statistics(
     """
     G = checked_path("truth.T_world_from_camera", truth.T_world_from_camera)
     P = checked_path("predicted.T_world_from_camera", predicted.T_world_from_camera, len(G))
-    if not 0 < fps < float("inf"):
-        raise ValueError(f"fps: expected a positive number, got {fps}")
+    checked_fps(fps)
     joints, present = _checked_joints("predicted", predicted, len(G))
     true_joints, true_present = _checked_joints("truth", truth, len(G))
     both = present & true_present

@@ -72,7 +72,7 @@ def draw_overlay(
     drawn = np.array(image)
     model = hand_model or episode.default_hand_model()
     state, there = episode.hand_state[frame_index], episode.presence[frame_index]
-    space = episode.meta.get("shape_space")
+    space = episode.meta.get("shape_space") if there.any() else None  # no hand, no shape
     joints = np.asarray(model.keypoints(state, space))
     if mesh:
         for hand in np.argsort(-joints[:, 0, 2]).tolist():

@@ -7,7 +7,15 @@ from pathlib import Path
 import pytest
 from huggingface_hub import ModelCard
 
-from mint_hub.cards.model import NO_RESULTS, card_head, check_model_card, load_results, render
+from mint_hub.cards.__main__ import main
+from mint_hub.cards.model import (
+    NO_RESULTS,
+    card_head,
+    check_model_card,
+    keep_results,
+    load_results,
+    render,
+)
 from mint_hub.cards.sources import CardError
 from mint_hub.evaluation.clips import Source
 from mint_hub.evaluation.evaluate import evaluate
@@ -19,7 +27,9 @@ FOLDER = Path(__file__).parents[2] / "model_card"
 
 @pytest.fixture
 def folder(tmp_path):
-    return shutil.copytree(FOLDER, tmp_path / "model_card")
+    """The card's sources without the results that are kept."""
+    ignore = shutil.ignore_patterns("results")
+    return shutil.copytree(FOLDER, tmp_path / "model_card", ignore=ignore)
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +42,7 @@ def results(tmp_path_factory):
     values = evaluate(source, Predictor.of(str(labels))).to_dict()
     del values["clips"]
     facts = {"name": "mint-small", "kind": "checkpoint", "weights": "0123456789abcdef"}
+    values["rows"][0]["name"] = "mint-small"
     return {**values, "prediction": facts}
 
 
@@ -61,9 +72,11 @@ def test_limits_and_licences_are_on_the_first_screen():
 
 
 def test_without_results_no_number_is_claimed():
-    if not load_results(FOLDER):
-        assert NO_RESULTS in render(FOLDER)
-        assert "model-index" not in card_head([])
+    models = [
+        r for r in load_results(FOLDER) if (r["prediction"] or {}).get("kind") == "checkpoint"
+    ]
+    assert (NO_RESULTS in render(FOLDER)) == (not models)
+    assert "model-index" not in card_head([])
 
 
 def test_results_become_a_table_and_a_model_index(folder, results):
@@ -77,8 +90,66 @@ def test_results_become_a_table_and_a_model_index(folder, results):
     assert found["MPJPE-p (mm)"].metric_value == pytest.approx(value, abs=1e-3)
     assert found["MPJPE-p (mm)"].dataset_revision == results["benchmark"]["hash"]
     assert card.data.model_name == "mint-small"
-    assert "| mean hand |" in text
-    assert "zero camera motion" in text
+    assert "| **mint-small** | mean hand | always present | zero camera motion |" in text
+    line = next(x for x in text.splitlines() if x.startswith("| MPJPE-p (mm) |"))
+    low, high = next(r for r in results["rows"] if r["row"] == "prediction")["hands"]["published"][
+        "MPJPE-p"
+    ][1:]
+    assert f"{value:.2f} [{low:.2f}, {high:.2f}]" in line
+
+
+def test_evaluations_of_the_same_clips_share_a_table(folder, results):
+    """Labels and rows without a model have columns, but no place in the model-index."""
+    labels = json.loads(json.dumps(results))
+    labels["prediction"] = {"name": "by hand", "kind": "labels", "episodes": 3}
+    labels["rows"][0]["name"] = "by hand"
+    bare = {**results, "prediction": None, "rows": results["rows"][1:]}
+    (folder / "results").mkdir()
+    for name, values in (("c", bare), ("b", labels), ("a", results)):
+        (folder / "results" / f"{name}.json").write_text(json.dumps(values))
+    text = render(folder)
+    assert text.count("| MPJPE-p (mm) |") == 1
+    assert "| **mint-small** | **by hand** | mean hand |" in text
+    assert "**by hand**: labels, not a model of this repository" in text
+    assert NO_RESULTS not in text
+    head = card_head(load_results(folder))
+    assert [entry["name"] for entry in head["model-index"]] == ["mint-small"]
+    names = [m["name"] for m in head["model-index"][0]["results"][0]["metrics"]]
+    assert names.count("MPJPE-p (mm)") == 1
+    (folder / "results" / "a.json").unlink()
+    assert NO_RESULTS in render(folder)
+    assert "model-index" not in card_head(load_results(folder))
+
+
+def test_results_are_kept_without_their_clips(folder, results, tmp_path):
+    made = tmp_path / "evaluation"
+    made.mkdir()
+    (made / "results.json").write_text(json.dumps({**results, "clips": [{"key": "a"}]}))
+    with pytest.raises(CardError, match=r"tables\.md: expected this file"):
+        keep_results(made, folder)
+    (made / "tables.md").write_text("# all\n")
+    kept = keep_results(made, folder)
+    assert kept == folder / "results" / "labels-mint-small.json"
+    assert kept.with_suffix(".md").read_text() == "# all\n"
+    assert load_results(folder) == [results]
+    assert keep_results(made, folder) == kept
+    with pytest.raises(CardError, match=r"results\.json: expected results .* got no file"):
+        keep_results(tmp_path, folder)
+
+
+def test_command_keeps_results_and_names_what_is_none(folder, results, tmp_path, monkeypatch):
+    made = tmp_path / "evaluation"
+    made.mkdir()
+    (made / "results.json").write_text(json.dumps(results))
+    (made / "tables.md").write_text("# all\n")
+    shutil.copytree(FOLDER.parent / "dataset_card", folder.parent / "dataset_card")
+    call = ["cards", str(folder.parent), "--keep", str(made)]
+    monkeypatch.setattr("sys.argv", [*call, str(tmp_path / "none")])
+    with pytest.raises(SystemExit, match=r"none/results\.json: expected results"):
+        main()
+    monkeypatch.setattr("sys.argv", call)
+    main()
+    assert "**mint-small**" in (folder / "README.md").read_text()
 
 
 def test_a_changed_result_makes_the_card_stale(folder, results):
@@ -92,8 +163,9 @@ def test_a_changed_result_makes_the_card_stale(folder, results):
 
 
 def test_errors_teach(folder, results):
-    with pytest.raises(CardError, match="expected results of a checkpoint"):
-        render(with_results(folder, {**results, "prediction": {"kind": "labels"}}))
+    lost = {k: v for k, v in results.items() if k != "rows"}
+    with pytest.raises(CardError, match="expected mint-hub evaluation with rows, got none"):
+        render(with_results(folder, lost))
     with pytest.raises(CardError, match="expected mint-hub evaluation, schema 1"):
         render(with_results(folder, {"kind": "other"}))
     (folder / "results" / "made.json").write_text("no")

@@ -83,3 +83,13 @@ def test_what_cannot_be_compared_is_said(sides):
     cut = tuple(replace(c, frames=29) for c in sides["near"].clips)
     with pytest.raises(ResultsError, match="expected the same frames, got 30 in A and 29 in B"):
         compare(sides["far"], replace(sides["near"], clips=cut))
+    (first, *rest) = sides["near"].clips
+    other = (replace(first, stamp="0" * 16), *rest)
+    with pytest.raises(ResultsError, match=r"clip-0: expected the same truth.*0{16} in B"):
+        compare(sides["far"], replace(sides["near"], clips=other))
+
+
+def test_few_clips_are_told(sides):
+    few = [replace(r, clips=r.clips[:7]) for r in (sides["far"], sides["near"])]
+    assert "no p can be below 0.05" in compare(*few).markdown()
+    assert "no p can be below" not in compare(sides["far"], sides["near"]).markdown()

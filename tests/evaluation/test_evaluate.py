@@ -13,6 +13,7 @@ from mint_hub.evaluation.results import Results, ResultsError
 from mint_hub.evaluation.scoring import ClipScorer
 from mint_hub.evaluation.strata import strata_of
 from mint_hub.evaluation.trivial import TRIVIAL, MeanHand, trivial_predictions
+from mint_hub.geometry import rigid
 from mint_hub.geometry.metrics import HAND_MEASURES, HandStatistics
 from mint_hub.inference.known_camera import correct_translation
 from mint_hub.loaders.schema import Episode
@@ -161,6 +162,21 @@ def test_scaled_hands_err_by_the_shift(source, truth):
     assert numbers["MPJPE-p"] == pytest.approx(0, abs=1e-3)
 
 
+def test_shapes_of_a_space_without_its_hand_are_the_mean_shape(source, truth):
+    """MANO's numbers never deform the template: a prediction without MANO has its mean hand."""
+    state = truth[0].hand_state.copy()
+    state[..., -10:] = np.where(truth[0].presence[..., None], 3.0, state[..., -10:])
+    theirs = replace(truth[0], hand_state=state, meta={**truth[0].meta, "shape_space": "mano"})
+    plain = state.copy()
+    plain[..., -10:] = 0
+    with pytest.warns(UserWarning, match="mean shape is used"):
+        got = ClipScorer(clip_of(source)).score(theirs).hands["published"]
+    want = ClipScorer(clip_of(source)).score(replace(truth[0], hand_state=plain))
+    assert got == want.hands["published"]
+    ours = ClipScorer(clip_of(source)).score(replace(truth[0], hand_state=state))
+    assert ours.hands["published"] != got
+
+
 # ------------------------------------------------------------------------- trivial rows
 
 
@@ -182,6 +198,8 @@ def test_mean_hand_of_one_constant_clip_is_that_hand(truth, tmp_path):
     (tmp_path / "m.json").write_text('{"frames": 3}')
     with pytest.raises(ValueError, match=r"m\.json: expected a mean hand"):
         MeanHand.load(tmp_path / "m.json")
+    with pytest.raises(ValueError, match=r"none\.json: expected a mean hand, found no file"):
+        MeanHand.load(tmp_path / "none.json")
     with pytest.raises(ValueError, match="expected frames with each hand"):
         MeanHand.of([without_hands(truth[0])], "none")
 
@@ -233,6 +251,37 @@ def test_a_camera_that_does_not_move_is_reported_and_not_ranked(truth, tmp_path)
     assert (camera["sequences"], camera["degenerate"]) == (2, 1)
 
 
+def test_a_prediction_that_does_not_move_is_told(source, truth, tmp_path):
+    still = [
+        replace(e, T_camera_from_world=np.tile(e.T_camera_from_world[:1], (60, 1, 1)))
+        for e in truth[:3]
+    ]
+    folder = save_all([*still, truth[3]], tmp_path / "stuck")
+    found = evaluate(source, Predictor.of(str(folder)))
+    (warning,) = found.warnings
+    assert warning.startswith("3 clips whose predicted camera does not move though the true one")
+    assert found.summary["prediction"]["camera"]["RPE-T mean"][0] == pytest.approx(0, abs=1e-6)
+    assert not evaluate(source).warnings  # zero camera motion is no prediction of anyone's
+
+
+def test_worlds_do_not_matter(source, truth, results, tmp_path):
+    """A prediction may live in any world: moving it as a whole changes no number."""
+    move = rigid.se3_exp(np.array([0.4, -1.1, 2.0, 3.0, -2.0, 5.0]))
+    labels = [noisy(e, 0.01) for e in truth]
+    moved_labels = [
+        replace(e, T_camera_from_world=e.T_camera_from_world @ np.asarray(rigid.inverse(move)))
+        for e in labels
+    ]
+    found = evaluate(source, Predictor.of(str(save_all(moved_labels, tmp_path / "moved"))))
+    one, two = (r.summary["prediction"] for r in (results, found))
+    assert one["hands"] == two["hands"]
+    pairs = [(one["camera"], two["camera"])]
+    pairs += [(numbers, two["world"][name]) for name, numbers in one["world"].items()]
+    for before, after in pairs:
+        for name, value in before.items():
+            np.testing.assert_allclose(after[name], value, rtol=1e-5, atol=1e-6, err_msg=name)
+
+
 def test_labels_that_lack_a_clip_are_refused_or_skipped(source, truth, tmp_path):
     folder = save_all(truth[1:], tmp_path / "some")
     with pytest.raises(MissingFilesError, match=r"some: expected labels of clip-0, found none"):
@@ -243,11 +292,15 @@ def test_labels_that_lack_a_clip_are_refused_or_skipped(source, truth, tmp_path)
     assert any("1 clip without a prediction" in w for w in found.warnings)
 
 
-def test_folders_without_anything_are_named(tmp_path):
+def test_folders_without_anything_are_named(source, tmp_path):
     with pytest.raises(MissingFilesError, match="expected a checkpoint"):
         Predictor.of(str(tmp_path))
     with pytest.raises(MissingFilesError, match="found none"):
         Predictor.of(str(tmp_path / "nothing"))
+    with pytest.raises(
+        MissingFilesError, match="there is no folder nothing: it is taken for a hub"
+    ):
+        Predictor.of("nothing").open().predict(clip_of(source))
     with pytest.raises(MissingFilesError, match="found no folder"):
         open_benchmark(Source("labels", str(tmp_path / "nothing")))
     with pytest.raises(MissingFilesError, match="expected a corpus"):

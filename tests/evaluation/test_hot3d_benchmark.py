@@ -45,6 +45,58 @@ def real(real_dir: Path) -> Path:
 # ----------------------------------------------------------------------- real ground truth
 
 
+@pytest.fixture
+def copied(real, tmp_path):
+    """A sequence whose files may be spoilt."""
+    folder = tmp_path / "P"
+    for path in real.rglob("*"):
+        if path.is_file():
+            there = folder / path.relative_to(next(real.iterdir()))
+            there.parent.mkdir(parents=True, exist_ok=True)
+            there.write_bytes(path.read_bytes())
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (
+            "mano_hand_pose_trajectory.jsonl",
+            r"trajectory\.jsonl: expected this file, found none; is",
+        ),
+        ("online_calibration.jsonl", r"expected online_calibration\.jsonl .*found neither; is"),
+        ("masks/mask_headset_pose_available.csv", r"available\.csv: no such file; .*; is"),
+    ],
+)
+def test_a_sequence_without_a_file_says_which_and_where_to_get_it(copied, name, message):
+    (copied / name).unlink()
+    with pytest.raises(MissingFilesError, match=f"{message} the download whole.*https://"):
+        open_benchmark(Source("hot3d", str(copied))).clip(0)
+
+
+def test_a_file_cut_short_is_named(copied):
+    path = copied / "headset_trajectory.csv"
+    path.write_bytes(path.read_bytes()[:3000])
+    with pytest.raises(BenchmarkError, match=r"headset_trajectory\.csv: .* is the download whole"):
+        open_benchmark(Source("hot3d", str(copied))).clip(0)
+
+
+def test_hands_off_screen_are_no_false_alarm_of_the_last_frame(real, mano_dir):
+    """Motion capture knows hands off screen; who says they are there is wrong by Presence-BA."""
+    source = Source("hot3d", str(real), mano_dir=mano_dir)
+    clip = open_benchmark(source).clip(0)
+    seen = ClipScorer(clip).seen()
+    assert clip.truth.presence.all()
+    assert seen.any()
+    assert not seen.all()
+    told = replace(clip.truth, presence=seen)
+    copied = ClipScorer(clip).score(clip.truth).hands["published"].metrics()
+    assert ClipScorer(clip).score(told).hands["published"].metrics()["Presence-BA"] == 1
+    assert copied["Presence-BA"] < 1
+    row = evaluate(source).summary["last frame copied"]["hands"]["published"]
+    assert row["Presence-BA"][0] > 0.9
+
+
 def test_real_cameras_are_ideal_against_themselves_and_off_by_the_shift(real, tmp_path):
     source = Source("hot3d", str(real))
     clip = open_benchmark(source).clip(0)
@@ -78,9 +130,11 @@ def test_real_hands_score_with_files_in_manos_format(real, mano_dir):
         ClipScorer(clip).score(e).hands["published"].metrics()
         for e in (clip.truth, moved(clip.truth, 0.1))
     )
-    if np.isfinite(own["CT-p"]):
-        assert own["CT-p"] == pytest.approx(0, abs=1e-9)
-        assert far["CT-p"] == pytest.approx(0.1, abs=1e-6)
+    assert clip.truth.presence.all()
+    assert own["CT-p"] == pytest.approx(0, abs=1e-9)
+    assert own["MPJPE-p"] == pytest.approx(0, abs=1e-9)
+    assert far["CT-p"] == pytest.approx(0.1, abs=1e-6)
+    assert far["MPJPE-p"] == pytest.approx(0, abs=1e-9)
     assert ClipScorer(clip).score(clip.truth).world["SE(3)"].metrics()["W-MPJPE"] < 1e-6
 
 

@@ -20,7 +20,7 @@ from mint_hub.evaluation.figures import (
 from mint_hub.evaluation.predictor import Predictor
 from mint_hub.evaluation.published import published_tables
 from mint_hub.evaluation.report import worst_clips, write_report
-from mint_hub.evaluation.tables import all_tables, published
+from mint_hub.evaluation.tables import all_tables, main_tables, published
 from mint_hub.evaluation.trivial import TRIVIAL
 from mint_hub.geometry.metrics import HAND_MEASURES
 from mint_hub.loaders.clips import encode_clip
@@ -60,13 +60,41 @@ def test_every_table_has_the_trivial_rows(made):
     tables = {t.title: t for t in all_tables(results)}
     hands = tables["Hands in the camera frame"]
     assert hands.columns[:3] == ("FAcc", "Recall", "F1")
-    assert len(hands.columns) == len(HAND_MEASURES)
+    ours = tables["Hands in the camera frame: beyond the paper's protocol"]
+    assert hands.columns + ours.columns == tuple(m.title for m in HAND_MEASURES)
     found = {name for table in tables.values() for name, _ in table.rows}
     assert set(TRIVIAL) <= found
     for title, table in tables.items():
         if not title.startswith("By stratum"):
             assert table.kinds.count("ours") == 1
             assert table.kinds.count("trivial") >= 2
+
+
+def test_columns_without_a_number_are_left_out(made):
+    """Clips of a second have no drift over 10 s: no column of dashes."""
+    table = next(t for t in all_tables(made[2]) if t.title.endswith("scale and drift"))
+    assert "ATE mean (mm)" in table.columns
+    assert not [c for c in table.columns if c.startswith("ATE 1")]
+    assert all(len(cells) == len(table.columns) for _, cells in table.rows)
+
+
+def test_bins_of_a_stratum_that_has_one_only_are_not_listed(made):
+    names = [name for name, _ in next(t for t in all_tables(made[2]) if "stratum" in t.title).rows]
+    kinds = [name.partition(":")[0] for name in names]
+    assert "wrist depth" in kinds
+    assert "source" not in kinds
+    assert min(map(kinds.count, kinds)) > 1
+
+
+def test_terminal_has_a_line_a_number(made):
+    table = main_tables(made[2])[0]
+    lines = table.text().splitlines()
+    assert len(lines) == 1 + len(table.columns)
+    assert lines[0].startswith("Hands in the camera frame  off <b>")
+    assert lines[4].split("  ")[0] == "MPJPE-p (mm)"
+    name, cells = table.rows[1]
+    at = lines[0].index(name)
+    assert lines[4][at:].startswith(f"{cells[3].text} {cells[3].interval}")
 
 
 def test_page_opens_offline_and_says_what_is_whose(made, tmp_path):

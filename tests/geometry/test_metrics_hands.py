@@ -17,8 +17,11 @@ from mint_hub.geometry.metrics import (
     HAND_MEASURES,
     Hands,
     HandStatistics,
+    Measure,
     canonical_joints,
     hand_statistics,
+    measure_of,
+    present_hands,
 )
 from mint_hub.geometry.rotations import rotvec_to_matrix
 
@@ -125,6 +128,8 @@ def test_what_is_on_screen(uv: tuple[float, float], z: float, present: bool) -> 
     found = score(truth, truth)
     assert (found.tp, found.fp, found.facc_correct) == (present, 0, present)
     assert found.off_screen_predicted == (not present)
+    assert present_hands(truth, K, SIZE_HW).tolist() == [[present, False]]
+    assert not present_hands(gone(truth), K, SIZE_HW).any()
 
 
 def test_one_joint_on_screen_makes_a_hand_and_only_it_is_measured_in_pixels() -> None:
@@ -416,6 +421,17 @@ def test_no_present_hand_is_nan() -> None:
     assert alarm["F1"] == 0
     assert isnan(alarm["MPJPE-p"])
     assert all(isnan(value) for value in HandStatistics().metrics().values())
+
+
+def test_columns_of_tables_know_their_measure() -> None:
+    for name in ("RPE-T mean", "RPE-T, Sim(3) mean", "RPE-T 1 s median", "ATE 10 min mean"):
+        assert measure_of(name).title == f"{name} (mm)"
+        assert measure_of(name).ideal == 0
+    assert measure_of("EPE-p, known") == Measure("EPE-p, known", "px", 0.0)
+    assert measure_of("FAcc").title == "FAcc"
+    assert measure_of("Field of view error").unit == "deg"
+    assert measure_of("Arc-length ratio (predicted / true) mean").ideal == 1
+    assert measure_of("Arc-length ratio (direction disputed)").ideal is None
 
 
 def test_bad_input_is_named() -> None:
