@@ -100,11 +100,7 @@ def camera_path(
     eye = eye + strength * style.bob * bob
     target = _gaze_path(style, gaze, t, rng)
     target = target + strength * 0.012 * smooth_noise(rng, t, 3, 0.9)
-    ahead = target - eye
-    ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
-    right = np.cross(ahead, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    level = np.stack([right, np.cross(ahead, right), ahead], -2)
+    level = _level(target - eye)
     wobble = strength * style.jitter * smooth_noise(rng, t, 3, 2.2)
     roll = np.deg2rad(rng.uniform(-4, 4)) + np.deg2rad(2.0) * smooth_noise(rng, t, 1, 0.5)[:, 0]
     tilt = np.stack([-style.lift + 0 * t, 0 * t, roll], -1)
@@ -140,14 +136,19 @@ def _gaze_path(
 
 
 def _duration(eye: Floats, start: Floats, stop: Floats, least: float, speed: float) -> float:
-    """Seconds of a shift of gaze whose fastest turn is at most ``speed``, radians a second.
+    """Seconds of a shift of gaze whose fastest turn is at most ``speed``, radians a second."""
+    u = np.linspace(0, 1, 65)
+    level = _level(start + minimum_jerk(u)[:, None] * (stop - start) - eye)
+    fastest = float(np.max(geodesic_angle(level[1:], level[:-1]))) * (len(u) - 1)
+    return max(least, fastest / speed)
 
-    On the chord between two directions an angle a turns as 2 tan(a / 2) would in its middle, where
-    a minimum-jerk shift runs at 15 / 8 of its mean speed.
-    """
-    first, second = (d / np.linalg.norm(d) for d in (start - eye, stop - eye))
-    angle = min(2 * np.arcsin(min(np.linalg.norm(second - first) / 2, 1.0)), np.deg2rad(150))
-    return max(least, float(15 / 8 * 2 * np.tan(angle / 2) / speed))
+
+def _level(ahead: Floats) -> Floats:
+    """Rotations (T, 3, 3), camera from workplace, that look along (T, 3) with a level horizon."""
+    ahead = ahead / np.linalg.norm(ahead, axis=-1, keepdims=True)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    return np.stack([right, np.cross(ahead, right), ahead], -2)
 
 
 def median_steps(T_camera_from_work: Floats) -> tuple[float, float]:

@@ -9,7 +9,14 @@ import pytest
 from mint_hub.geometry.camera import fov_vh_to_K
 from mint_hub.geometry.lenses import KannalaBrandtLens, PinholeLens
 from mint_hub.loaders.clips import decode_window
-from mint_hub.synth.corruption import Corruption, corrupt, covering_fov, encode, lens_maps
+from mint_hub.synth.corruption import (
+    TONE_MIDDLE,
+    Corruption,
+    corrupt,
+    covering_fov,
+    encode,
+    lens_maps,
+)
 from mint_hub.synth.render import Rendered
 
 HW = (60, 80)
@@ -112,6 +119,29 @@ def test_what_the_pinhole_does_not_see_is_black():
     assert (seen.rgb[30, 40] > 0).all()
 
 
+def test_exposure_is_in_stops():
+    grey = [replace(f, rgb=np.full((*HW, 3), 150, np.uint8)) for f in frames(1)]
+    for stops in (-1.5, 0.5):
+        (seen,) = corrupt(grey, Corruption(exposure=stops), 0)
+        assert np.log2((seen.rgb.mean() / 150) ** 2.2) == pytest.approx(stops, abs=0.03)
+
+
+def test_contrast_spreads_codes_about_the_middle_and_keeps_their_order():
+    ramp = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, -1)
+    frame = Rendered(0, ramp)
+    (hard,) = corrupt([frame], Corruption(contrast=1.8), 0)
+    (soft,) = corrupt([frame], Corruption(contrast=0.6), 0)
+    codes = hard.rgb[0, :, 0].astype(int)
+    assert (np.diff(codes) >= 0).all()
+    assert (codes[0], codes[255]) == (0, 255)
+    middle = round(255 * TONE_MIDDLE)
+    assert abs(codes[middle] - middle) <= 1
+    slope = (codes[middle + 20] - codes[middle - 20]) / 40
+    assert slope == pytest.approx(1.8, rel=0.1)  # 20 codes from the middle it is a little less
+    gentle = soft.rgb[0, :, 0].astype(int)
+    assert (gentle[middle + 20] - gentle[middle - 20]) / 40 == pytest.approx(0.6, rel=0.1)
+
+
 def test_pictures_become_a_clip():
     clip = encode(frames(4), Corruption(crf=10))
     shown = decode_window(clip, 0, 4)[2].astype(float)
@@ -123,6 +153,10 @@ def test_bad_settings_are_named():
         Corruption(shutter=1.5)
     with pytest.raises(ValueError, match="read_noise"):
         Corruption(read_noise=-0.1)
+    with pytest.raises(ValueError, match="contrast: expected 0.2 to 4, got 9"):
+        Corruption(contrast=9)
+    with pytest.raises(ValueError, match="exposure: expected -6 to 6, got 7"):
+        Corruption(exposure=7)
     with pytest.raises(ValueError, match="flow"):
         next(corrupt([replace(frames(1)[0], flow=None)], Corruption(shutter=0.5), 0))
     with pytest.raises(ValueError, match="fov_vh_rad"):

@@ -6,7 +6,14 @@ from hypothesis import strategies as st
 
 from mint_hub.geometry.rigid import rigid
 from mint_hub.geometry.rotations import geodesic_angle, rotvec_to_matrix
-from mint_hub.synth.camera_motion import camera_path, draw_style, median_steps
+from mint_hub.synth.camera_motion import (
+    QUICK_TURN_RAD_S,
+    TURN_RAD_S,
+    HeadStyle,
+    camera_path,
+    draw_style,
+    median_steps,
+)
 from mint_hub.synth.motion import AngleTrack, PoseTrack, envelope, minimum_jerk, smooth_noise
 
 
@@ -77,3 +84,29 @@ def test_the_head_looks_where_the_hands_work():
     assert np.rad2deg(np.abs(np.arcsin(path[:, 0, 2]))).max() < 25
     still, lively = (median_steps(camera_path(style, [], times, s)) for s in (0.2, 2.0))
     assert lively[0] > 3 * still[0]
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.floats(-1.2, 1.2), st.floats(0.1, 0.9), st.floats(-0.2, 0.3), st.booleans())
+def test_heads_turn_no_faster_than_heads_do(x, y, z, quick):
+    """One shift of gaze by a head that does nothing else, wherever it goes."""
+    goal = np.array([x, y, z])
+    style = HeadStyle(
+        eye=np.array([0.0, -0.1, 0.5]),
+        lift=0.0,
+        follow=1.0,
+        lean=np.zeros(3),
+        bob=0.0,
+        step_hz=1.5,
+        jitter=0.0,
+        away=((1.5, goal, 0.5),) if quick else (),
+        seed=3,
+    )
+    gaze = [] if quick else [(1.5, goal)]
+    times = np.arange(0, 6, 1 / 120)
+    R = camera_path(style, gaze, times, strength=0.0)[:, :3, :3]
+    speed = np.asarray(geodesic_angle(R[1:], R[:-1])) * 120
+    limit = QUICK_TURN_RAD_S if quick else TURN_RAD_S
+    assert speed.max() < 1.02 * limit + np.deg2rad(12)  # roll drifts beside it
+    if np.linalg.norm(goal - [0.0, 0.26, 0.03]) > 0.1:
+        assert speed.max() > 0.05  # it did turn
