@@ -158,6 +158,8 @@ class MintConfig(PreTrainedConfig):
             "hand_hidden_size": 192,
             "hand_heads": 6,
             "presence_hidden_size": 96,
+            "window": 16,
+            "aggregator_layer_scale": 1.0,
             "shape_space": "mint",
         }
         return cls(**(sizes | overrides))

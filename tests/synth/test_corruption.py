@@ -153,7 +153,7 @@ def test_bad_settings_are_named():
         Corruption(shutter=1.5)
     with pytest.raises(ValueError, match="read_noise"):
         Corruption(read_noise=-0.1)
-    with pytest.raises(ValueError, match="contrast: expected 0.2 to 4, got 9"):
+    with pytest.raises(ValueError, match=r"contrast: expected 0\.2 to 4, got 9"):
         Corruption(contrast=9)
     with pytest.raises(ValueError, match="exposure: expected -6 to 6, got 7"):
         Corruption(exposure=7)
