@@ -17,7 +17,6 @@ from mint_hub.conventions import SIDES
 from mint_hub.geometry.rigid import rigid
 from mint_hub.geometry.rotations import rotvec_to_matrix
 from mint_hub.synth.actors import Arm, Item
-from mint_hub.synth.hand_pose import POSTURES
 from mint_hub.synth.motion import PoseTrack
 from mint_hub.synth.person import clamps, outward
 from mint_hub.synth.tabletop import Tabletop
@@ -339,7 +338,7 @@ def press(table: Tabletop, arm: Arm, start: float) -> bool:
         arm.angles.moves.pop()  # the finger stays stretched between taps
         arm.angles.target = grasp.angles_deg.copy()
     item.used += 1
-    arm.angles.to(POSTURES["relaxed"], time, 0.4)
+    arm.angles.to(table.person.posture("relaxed", arm.side, abs(round(10 * time))), time, 0.4)
     table.say(f"{arm.side} hand presses the {item.thing.name}", arm.side, start, time)
     return True
 

@@ -128,10 +128,12 @@ def _gaze_path(
     past = [e for e in events if e[0] < float(t[0]) - 1.2]
     at = past[-1][1] if past else centre
     path = np.tile(at, (len(t), 1)).astype(float)
+    free = -np.inf
     for time, goal, least, speed in events[len(past) :]:
         duration = _duration(style.eye, at, goal, least, speed)
-        path = path + minimum_jerk((t - time) / duration)[:, None] * (goal - at)
-        at = goal
+        begin = max(time, free)  # the next shift waits for most of this one: speeds do not add
+        path = path + minimum_jerk((t - begin) / duration)[:, None] * (goal - at)
+        free, at = begin + 0.75 * duration, goal
     return path
 
 

@@ -19,7 +19,7 @@ from mint_hub.geometry.lenses import Lens
 from mint_hub.loaders.clips import encode_clip
 from mint_hub.synth.render import Rendered
 
-DRIFT_S: Final = 40.0
+DRIFT_FRAMES: Final = 40.0
 """Frames over which exposure and colour drift: their time constant."""
 
 LONGEST_STEP_PX: Final = 1.5
@@ -107,7 +107,7 @@ def corrupt(
     maps: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
     for first, frame in enumerate(frames):
         kick = rng.standard_normal(2)
-        keep = np.exp(-1 / DRIFT_S) if first else 0.0
+        keep = np.exp(-1 / DRIFT_FRAMES) if first else 0.0
         drift = keep * drift + np.sqrt(1 - keep * keep) * kick
         linear = _to_linear()[frame.rgb]
         if settings.shutter > 0:

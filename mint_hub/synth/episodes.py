@@ -1,8 +1,10 @@
 """From worlds to episodes: pictures, exact labels, and shards like those of any other source.
 
 A hand counts as present when any of its 21 joints, more than 1 cm before the camera, projects into
-the image; ``presence_score`` is the share of it that nothing hides (``Renderer.visible_fraction``),
-which is what a presence head should learn from. Labels are written ``lossless``: they are exact.
+the image. ``presence_score``, which a presence head should learn from, is then the share of what
+lies of it inside the picture that nothing hides (``Renderer.visible_fraction``), and 0 for a hand
+that is not present: one whose skin reaches into the picture, but none of its joints. Labels are
+written ``lossless``: they are exact.
 
 A clip filmed through a lens has bent pictures (depth and segments with them), and presence is what
 these show. Its camera is, by the convention of ``Episode``, a pinhole: that of
@@ -32,6 +34,7 @@ from mint_hub.loaders.schema import Episode
 from mint_hub.loaders.shards import CorpusReport, write_corpus
 from mint_hub.synth.corruption import Corruption, corrupt, encode
 from mint_hub.synth.figure import LEFT_HAND, RIGHT_HAND
+from mint_hub.synth.gl import make_context
 from mint_hub.synth.lensing import (
     Bend,
     draw_lens,
@@ -40,7 +43,7 @@ from mint_hub.synth.lensing import (
     require_share,
     seen_through,
 )
-from mint_hub.synth.presets import GENERATOR, preset_named, seed_of
+from mint_hub.synth.presets import GENERATOR, REVISION, preset_named, rng_of, seed_of
 from mint_hub.synth.render import Rendered, Renderer
 from mint_hub.synth.scene import make_world
 from mint_hub.synth.world import World
@@ -54,6 +57,9 @@ __all__ = [
     "presence_of",
     "synthesise",
 ]
+
+SHARD_BYTES: Final = 8 << 20
+"""A handful of clips: what an interrupted run makes again is less than a shard."""
 
 MP4: Final = "mp4"
 DEPTH: Final = "depth.npz"
@@ -88,8 +94,7 @@ def presence_of(world: World) -> NDArray[np.bool_]:
 
 def draw_corruption(world: World) -> Corruption:
     """The camera that takes a world's pictures: how bad it is, drawn from the world's seed."""
-    stream = preset_named(world.preset).stream
-    rng = np.random.default_rng([GENERATOR, stream, world.seed, _CAMERA_STREAM])
+    rng = rng_of(world.preset, world.seed, _CAMERA_STREAM)
     return Corruption(
         shutter=round(float(rng.uniform(0, 0.45) * (rng.random() < 0.7)), 3),
         exposure_drift=round(float(rng.uniform(0, 0.12)), 3),
@@ -187,7 +192,7 @@ def _labels(world: World, visible: NDArray[np.float32], settings: Corruption) ->
         fov_vh_rad=np.tile(fov_vh_rad.astype(np.float32), (world.num_frames, 1)),
         hand_state=state.astype(np.float32),
         presence=presence,
-        presence_score=np.clip(visible, 0.0, 1.0),
+        presence_score=np.where(presence, np.clip(visible, 0.0, 1.0), 0).astype(np.float32),
         image_size_hw=size_hw,
         text=world.text,
         meta={
@@ -289,6 +294,8 @@ def synthesise(
 ) -> CorpusReport:
     """Write a split of synthetic clips, ``folder/config/split``; called again, it goes on.
 
+    Going on, it keeps the shards that were finished, and makes no clip of these again.
+
     Args:
         folder: of the corpus.
         preset: "train", "bench" or "bench-ood".
@@ -306,7 +313,7 @@ def synthesise(
 
     Raises:
         ImportError, RuntimeError: as ``make_clip`` does.
-        CorpusError: as ``write_corpus`` does.
+        CorpusError: as ``write_corpus`` does; an unfinished split was begun with other arguments.
         ValueError: an unknown preset, a number of episodes that it does not have, a bad scale
             or share of lenses.
 
@@ -321,6 +328,7 @@ def synthesise(
     maker = _Maker(
         preset, num_frames, _check_scale(scale), require_share(lens, preset), depth, segmentation
     )
+    make_context().release()  # say what is missing before a world or a folder is made
     clips = _Clips(maker, seeds, num_procs)
     try:
         return write_corpus(
@@ -330,9 +338,16 @@ def synthesise(
             split or ("train" if kind.clips is None else "validation"),
             format="lossless",
             extra=True,
+            shard_bytes=SHARD_BYTES,
             seed=None,
             progress=progress,
             extra_members=clips.members_of,
+            made_with={
+                **asdict(maker),
+                **({"seed": seed} if kind.clips is None else {}),
+                "generator": GENERATOR,
+                "revision": REVISION,
+            },
         )
     finally:
         clips.close()
@@ -365,28 +380,32 @@ class _Maker:
 
 
 class _Clips:
-    """Clips by number, made ahead by other processes once they are asked for in a row."""
+    """Clips by number, in a row from the first that is asked for; other processes make them ahead.
+
+    Their keys are known before they are made.
+    """
 
     def __init__(self, maker: _Maker, seeds: Collection[int], num_procs: int) -> None:
         self._maker, self._seeds, self._num_procs = maker, list(seeds), num_procs
         self._stream: Generator[Clip] | None = None
-        self._next, self._stop = -1, 0
+        self._next = -1
         self._members: dict[str, dict[str, bytes]] = {}
 
     def __len__(self) -> int:
         return len(self._seeds)
 
     def __getitem__(self, i: int, /) -> Episode:
-        if self._stream is None or i != self._next or i >= self._stop:
-            in_a_row = i in (0, self._next)
+        if self._stream is None or i != self._next:
             self.close()
-            self._stop = len(self._seeds) if in_a_row else i + 1
-            seeds = self._seeds[i : self._stop]
-            self._stream = in_order(self._maker, seeds, self._num_procs, 1, start="spawn")
+            self._stream = in_order(self._maker, self._seeds[i:], self._num_procs, 1, start="spawn")
         clip = next(self._stream)
+        assert clip.episode.key == self.key(i)
         self._next = i + 1
         self._members = {clip.episode.key: clip.members}
         return clip.episode
+
+    def key(self, i: int, /) -> str:
+        return f"synth-{self._maker.preset}-{self._seeds[i]:x}"
 
     def members_of(self, episode: Episode) -> dict[str, bytes]:
         return self._members[episode.key]

@@ -21,7 +21,15 @@ from mint_hub.geometry.hand_model import HandModel, chain
 from mint_hub.geometry.rotations import rotvec_to_matrix
 from mint_hub.synth.hand_anatomy import REST_TURN, SPLAY_DEG, THUMB_DIRECTIONS, THUMB_PALMAR
 
-__all__ = ["DIGITS", "LIMITS_DEG", "NUM_ANGLES", "POSTURES", "HandProxy", "joint_rotations"]
+__all__ = [
+    "DIGITS",
+    "LIMITS_DEG",
+    "NUM_ANGLES",
+    "POSTURES",
+    "HandProxy",
+    "joint_rotations",
+    "varied",
+]
 
 Floats = NDArray[np.float64]
 
@@ -126,6 +134,18 @@ POSTURES: Final[dict[str, Floats]] = {
     "hook": _posture(_even(22, 66, 40, 1), {"pinky": 5}, (22, 6, 2, 10, 14)),
 }
 """Postures by name, (21,) degrees; each is inside LIMITS_DEG."""
+
+
+def varied(angles_deg: Floats, rng: np.random.Generator, size: float = 1.0) -> Floats:
+    """Change a posture (21,) as people's differ: the whole hand, each finger, each joint a little.
+
+    ``size`` 1: deviations of 12 degrees of curl for the hand, 10 more for each finger, 6 more for
+    each of its joints, 4 of spread, 9 of the thumb's joints. The result is inside LIMITS_DEG.
+    """
+    curl = rng.normal(0, 12) + rng.normal(0, 10, (4, 1)) + rng.normal(0, 6, (4, 3))
+    fingers = np.column_stack([curl * (1.0, 1.2, 0.6), rng.normal(0, 4, 4)])
+    change = np.concatenate([fingers.ravel(), rng.normal(0, 9, 5) * (1.0, 1.0, 0.5, 1.0, 1.2)])
+    return np.clip(angles_deg + size * change, *LIMITS_DEG.T)
 
 
 @dataclass(frozen=True, eq=False)

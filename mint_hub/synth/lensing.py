@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mint_hub.geometry.camera import K_to_fov_vh, fov_vh_to_K, on_screen, project
 from mint_hub.geometry.lenses import KannalaBrandtLens, Lens, OpenCVLens, rectification
 from mint_hub.synth.corruption import covering_fov, lens_maps
-from mint_hub.synth.presets import GENERATOR, preset_named
+from mint_hub.synth.presets import preset_named, rng_of
 from mint_hub.synth.world import World
 
 __all__ = ["Bend", "draw_lens", "in_picture", "pinhole_of", "require_share", "seen_through"]
@@ -61,8 +61,7 @@ def draw_lens(world: World, share: float) -> Lens | None:
     """
     if world.lens is not None:
         raise ValueError("world, lens: expected none yet, got one")
-    stream = preset_named(world.preset).stream
-    rng = np.random.default_rng([GENERATOR, stream, world.seed, LENS_STREAM])
+    rng = rng_of(world.preset, world.seed, LENS_STREAM)
     if rng.random() >= require_share(share, world.preset):
         return None
     fisheye = bool(rng.random() < FISHEYES)

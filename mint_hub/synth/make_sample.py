@@ -56,12 +56,12 @@ class Chosen:
 
 
 CHOSEN: Final = (
-    Chosen("sample", 78, 0.8),
+    Chosen("sample", 109, 0.75),
     Chosen("sample-2", 12, 0.6),
     Chosen("sample-3", 17, 0.75),
 )
-"""A bowl lifted by both hands, then a jar and a can; close up, with a lively head; a parcel, quick
-turns of the head, and a hand that leaves the picture."""
+"""Jar, block and bottle, in a wide view; close up, with a lively head; a parcel, turns of the head, and a
+hand that leaves the picture."""
 
 
 def sample_clips() -> Iterator[Clip]:

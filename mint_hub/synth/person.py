@@ -17,7 +17,7 @@ from mint_hub.conventions import SIDES, Side
 from mint_hub.geometry.rigid import rigid
 from mint_hub.synth.grasps import Grasp, aligned, fit, hand_axes, opposed, posture_for
 from mint_hub.synth.hand_anatomy import straight_axes
-from mint_hub.synth.hand_pose import POSTURES, HandProxy
+from mint_hub.synth.hand_pose import POSTURES, HandProxy, varied
 from mint_hub.synth.motion import minimum_jerk
 from mint_hub.synth.things import Grip, Thing
 
@@ -28,6 +28,10 @@ Avoid = Callable[[Floats], float]
 
 _MOST_EFFORT: Final = 1.1
 _FITS: Final = 5
+
+GRIP_VARIES: Final = 0.8
+"""How much grips differ between people and things, as `hand_pose.varied` has it; the fit then takes
+the fingers that touch to the surface, and the others stay."""
 
 
 def outward(side: Side) -> float:
@@ -46,6 +50,7 @@ class Person:
         elbow_up: height of the elbows.
         tempo: factor on all durations.
         dominant: the side that does more.
+        habits: seed of how postures differ from the named ones, see `posture`.
 
     """
 
@@ -55,6 +60,17 @@ class Person:
     elbow_up: float
     tempo: float
     dominant: Side
+    habits: int = 0
+
+    def posture(self, name: str, side: Side, occasion: int = 0) -> Floats:
+        """Angles (21,) of a named posture as this person has it, another one each occasion."""
+        words = (self.habits, SIDES.index(side), sum(map(ord, name)), occasion)
+        return varied(POSTURES[name], np.random.default_rng(words))
+
+    def grip(self, angles_deg: Floats, side: Side, thing: Thing) -> Floats:
+        """Angles (21,) from which this person closes a hand on a thing, given the usual ones."""
+        words = (self.habits, SIDES.index(side), round(1e6 * (thing.radius + thing.height)))
+        return varied(angles_deg, np.random.default_rng(words), GRIP_VARIES)
 
     def elbow(self, side: Side, wrist: Floats) -> Floats:
         """Elbow (..., 3) that goes with a wrist position (..., 3): it follows, a third as far."""
@@ -86,7 +102,9 @@ class Person:
         turned += 0.9 * max(0.0, -float(thumb[2]) - 0.25) + 0.6 * max(0.0, thumb[0] * out - 0.2)
         return bent + turned
 
-    def resting(self, side: Side, rng: np.random.Generator, posture: str = "rest") -> Floats:
+    def resting(
+        self, side: Side, rng: np.random.Generator, posture: str, angles_deg: Floats
+    ) -> Floats:
         """A hand lying on the table near its edge: T_work_from_wrist (4, 4)."""
         out = outward(side)
         ahead = np.array([-out * rng.uniform(0.1, 0.5), 1.0, -0.05])
@@ -94,7 +112,7 @@ class Person:
         if posture == "loose_fist":
             palm = np.array([-out * rng.uniform(0.5, 0.9), 0.0, -0.6])
         at = np.array([out * rng.uniform(0.13, 0.25), rng.uniform(-0.01, 0.10), 0.0])
-        return self.lowered(side, hand_axes(side, ahead, palm), at, POSTURES[posture], 0.0015)
+        return self.lowered(side, hand_axes(side, ahead, palm), at, angles_deg, 0.0015)
 
     def lap(self, side: Side, rng: np.random.Generator) -> Floats:
         """A hand out of sight, beside the body below the table."""
@@ -131,6 +149,8 @@ def grasp_of(
     options: list[tuple[float, int, Floats, Floats, Grip]] = []
     for grip in thing.grips:
         angles = posture_for(person.proxy, grip.style, grip.width)
+        if grip.style != "flat":
+            angles = person.grip(angles, side, thing)
         for begin in _starts(person, side, grip, angles, T_work_from_thing):
             effort = person.effort(side, T_work_from_thing @ begin)
             if effort < _MOST_EFFORT:

@@ -1,9 +1,9 @@
 """The three presets, and which clips a trainer must refuse.
 
 ``train`` is unbounded. ``bench`` is forty clips of the same generator from reserved seeds.
-``bench-ood`` is forty clips whose things, surfaces, activities, cameras and hand shapes train
-cannot produce: the tables and ranges of the two are disjoint, entry by entry. A preset's seeds are
-a stream of their own: no seed of ``train`` gives a clip of a bench.
+``bench-ood`` is forty clips whose things, surfaces, activities, fields of view, image sizes, camera
+heights and sides, and hand shapes train cannot produce: those tables and ranges are disjoint. A
+preset's seeds are a stream of their own: no seed of ``train`` gives a clip of a bench.
 
 A clip is known by its `fingerprint`, a hash of numbers that are drawn on an exact float32 grid and
 survive shards, windows and other labels of the same clip: horizontal field of view and hand shape.
@@ -33,6 +33,7 @@ __all__ = [
     "GENERATOR",
     "PRESETS",
     "RESERVED_SEEDS",
+    "REVISION",
     "Preset",
     "bench_fingerprints",
     "fingerprint",
@@ -40,11 +41,14 @@ __all__ = [
     "is_bench",
     "on_grid",
     "preset_named",
+    "rng_of",
     "seed_of",
 ]
 
 GENERATOR: Final = 1
-"""Goes up when the same seed gives another clip than before; benches are frozen for each."""
+REVISION: Final = 2
+"""The first goes up when the same seed gives another clip, the second when the same clip is moved,
+labelled or drawn otherwise; benches are frozen for each, and drawn ones are kept apart."""
 
 BENCH_CLIPS: Final = 40
 BENCH_FILE: Final = "synth_benches.txt"
@@ -159,6 +163,16 @@ def seed_of(preset: str, seed: int, number: int) -> int:
     return drawn
 
 
+def rng_of(preset: str, seed: int, *more: int) -> np.random.Generator:
+    """Make a stream of random numbers of a clip; ``more`` names one of its streams.
+
+    The seed always takes two words: short entropy is padded with zeros, so that without them the
+    stream 0 of a small seed would be the clip's own.
+    """
+    words = seed & 0xFFFFFFFF, seed >> 32
+    return np.random.default_rng([GENERATOR, preset_named(preset).stream, *words, *more])
+
+
 def on_grid(value: Any, steps: int) -> Any:
     """Round to multiples of 1 / ``steps`` (a power of two), which float32 holds exactly."""
     return np.round(np.asarray(value, float) * steps) / steps
@@ -199,7 +213,13 @@ def bench_fingerprints() -> Mapping[str, str]:
 
 
 def is_bench(episode: Episode) -> bool:
-    """Whether an episode is a clip of a bench, or a part of one: what training must not see."""
+    """Whether an episode is a clip of a bench, or a part of one: what training must not see.
+
+    Labels that somebody else made of its pictures are known by the clip's name.
+    """
+    names = (episode.key, str(episode.meta.get("uid") or ""))
+    if any(name.startswith("synth-bench-") for name in names):
+        return True
     synth = episode.meta.get("synth")
     preset = synth.get("preset") if isinstance(synth, dict) else None
     return preset in ("bench", "bench-ood") or fingerprint(episode) in bench_fingerprints()

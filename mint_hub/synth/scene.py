@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -29,10 +29,12 @@ from mint_hub.synth.person import Person
 from mint_hub.synth.presets import (
     FOV_STEPS,
     GENERATOR,
+    REVISION,
     SHAPE_STEPS,
     Preset,
     on_grid,
     preset_named,
+    rng_of,
 )
 from mint_hub.synth.room import Painter, Room, draw_room, lights, posed, standing
 from mint_hub.synth.tabletop import Tabletop
@@ -71,17 +73,18 @@ def make_world(seed: int, preset: str = "train", num_frames: int | None = None) 
     """
     kind = preset_named(preset)
     if seed < 0 or (kind.clips is not None and seed >= kind.clips):
-        raise ValueError(f"seed: expected 0 to {kind.clips or 'any'} for {preset}, got {seed}")
+        there = "0 or more" if kind.clips is None else f"0 to {kind.clips - 1}"
+        raise ValueError(f"seed: expected {there} for {preset}, got {seed}")
     if num_frames is not None and num_frames < 1:
         raise ValueError(f"num_frames: expected at least 1, got {num_frames}")
-    rng = np.random.default_rng([GENERATOR, kind.stream, seed])
+    rng = rng_of(preset, seed)
     low, high = kind.num_frames
     drawn = int(rng.integers(low, high + 1))
     times = np.arange(num_frames or drawn) / MODEL_FPS
     cast = _Cast.draw(rng, kind)
     best: tuple[Tabletop, Collisions] | None = None
     for attempt in range(_ATTEMPTS):
-        own = np.random.default_rng([GENERATOR, kind.stream, seed, attempt])
+        own = rng_of(preset, seed, attempt)
         table = _play(own, kind, cast, times)
         found = collisions(table, times[:: max(1, len(times) // 90)], cast.exists, seed)
         if best is None or found.share < best[1].share:
@@ -89,7 +92,7 @@ def make_world(seed: int, preset: str = "train", num_frames: int | None = None) 
         if found.share < _ENOUGH:
             break
     assert best is not None
-    filming = np.random.default_rng([GENERATOR, kind.stream, seed, _ATTEMPTS])
+    filming = rng_of(preset, seed, _ATTEMPTS)
     return _film(filming, kind, cast, best[0], times, seed, best[1])
 
 
@@ -127,6 +130,7 @@ class _Cast:
         tone = rng.beta(0.9, 1.4)
         skin = np.exp((1 - tone) * np.log(_SKIN_LIGHT) + tone * np.log(_SKIN_DARK))
         skin = skin * rng.uniform(0.92, 1.08, 3)
+        person = replace(person, habits=int(rng.integers(1 << 31)))
         return cls(room, person, exists, skin)
 
 
@@ -329,6 +333,8 @@ def _filmed(style: HeadStyle, table: Tabletop, times: Floats, preset: Preset) ->
             break
         strength *= 1.15
         path = camera_path(style, table.gaze, times, strength)
+    else:
+        assert not any(preset.least_step), "no strength moves this camera enough"
     return path
 
 
@@ -378,7 +384,7 @@ def _meta(cast: _Cast, table: Tabletop, found: Collisions) -> dict[str, Any]:
         "hand_size": float(person.proxy.shape_params[0]),
     }
     return {
-        "generator": GENERATOR,
+        "generator": f"{GENERATOR}.{REVISION}",
         "dominant": person.dominant,
         "hand_model": HandModel.template().name,
         "things": [item.thing.name for item in table.items],

@@ -17,7 +17,6 @@ from mint_hub.conventions import SIDES, Side
 from mint_hub.geometry.rotations import geodesic_angle, rotvec_to_matrix
 from mint_hub.synth.actors import Arm, Item, Mark, Plan, Said, Span, depths, trembling
 from mint_hub.synth.grasps import Grasp
-from mint_hub.synth.hand_pose import POSTURES
 from mint_hub.synth.motion import AngleTrack, PoseTrack, envelope, smooth_noise
 from mint_hub.synth.person import Avoid, Person, grasp_of, outward
 
@@ -50,9 +49,9 @@ class Tabletop:
         """Set the table: arms where ``idle`` says ("rest", "loose_fist" or "lap")."""
         arms: dict[Side, Arm] = {}
         for side in SIDES:
-            posture, T = _idle_pose(person, side, rng, idle[side], items, time)
+            angles, T = _idle_pose(person, side, rng, idle[side], items, time)
             spans = [Span(-np.inf, PoseTrack(T))]
-            arms[side] = Arm(side, spans, AngleTrack(POSTURES[posture]), time, idle[side])
+            arms[side] = Arm(side, spans, AngleTrack(angles), time, idle[side])
         return cls(person, rng, items, arms)
 
     # ---------------------------------------------------------------- small words
@@ -208,20 +207,21 @@ class Tabletop:
             plans.append([(clear, start + 0.5 * opening, quick, np.zeros(3))])
         (step,) = self._safest(arm, track, plans, span.grasp.opened_deg)
         left = track.to(*step)
-        arm.angles.to(POSTURES["relaxed"], left - 0.2, 0.5)
+        loose = self.person.posture("relaxed", arm.side, _tenths(left))
+        arm.angles.to(loose, left - 0.2, 0.5)
         span.item.free_at = left - 0.1
         arm.free_at = left - 0.12
         return left - 0.12
 
     def go_idle(self, arm: Arm, start: float, where: str) -> float:
         """Bring a free hand to rest on the table, or out of sight ("lap")."""
-        posture, T = _idle_pose(self.person, arm.side, self.rng, where, self.items, start)
+        angles, T = _idle_pose(self.person, arm.side, self.rng, where, self.items, start)
         if where == "lap" and arm.T[1, 3] > 0:
             edge = np.array(T)
             edge[:3, 3] = [outward(arm.side) * 0.27, -0.07, 0.075]
             start = self.move(arm, edge, start, None, 0.05, slower=1.1) - 0.2
         arc = 0.22 if arm.idle == "lap" else 0.08
-        end = self.move(arm, T, start, POSTURES[posture], arc, slower=1.15)
+        end = self.move(arm, T, start, angles, arc, slower=1.15)
         arm.idle = where
         arm.free_at = end
         return end
@@ -357,6 +357,11 @@ class Tabletop:
         return wrists, angles
 
 
+def _tenths(time: float) -> int:
+    """A number for an occasion: tenths of a second."""
+    return abs(round(10 * time))
+
+
 def _idle_pose(
     person: Person,
     side: Side,
@@ -364,17 +369,20 @@ def _idle_pose(
     where: str,
     items: Sequence[Item],
     time: float,
-) -> tuple[str, Floats]:
-    """Posture and T_work_from_wrist of a hand that does nothing, not on top of a thing."""
+) -> tuple[Floats, Floats]:
+    """Angles and T_work_from_wrist of a hand that does nothing, not on top of a thing."""
+    occasion = _tenths(time)
+    loose = person.posture("relaxed", side, occasion + 100)
     if where == "lap":
-        return "relaxed", person.lap(side, rng)
+        return loose, person.lap(side, rng)
+    angles = person.posture(where, side, occasion)
     soon = time + np.linspace(0.3, 4.0, 8)
     best, least = np.eye(4), np.inf
     for _ in range(12):
-        T = person.resting(side, rng, where)
-        hand = person.proxy.placed(T[None], POSTURES[where][None], side)
+        T = person.resting(side, rng, where, angles)
+        hand = person.proxy.placed(T[None], angles[None], side)
         hands = np.broadcast_to(hand, (len(soon), *hand.shape[1:]))
         depth = float(sum(depths(i.thing, i.track.at(soon), hands).max() for i in items))
         if depth < least:
             best, least = T, depth
-    return (where, best) if least < 0.006 else ("relaxed", person.lap(side, rng))
+    return (angles, best) if least < 0.006 else (loose, person.lap(side, rng))

@@ -11,9 +11,9 @@ from labels of the usual quality and a second from exact cameras. In this order:
 3. **Hands.** Wrist position (smooth and white, more along the ray than across), orientation and
    fingers jitter; a bias of depth, constant in a clip, moves both hands along their rays.
 4. **Outliers.** Now and then a hand is thrown off for a few frames, in position and orientation.
-5. **Missing.** Bursts of frames lose a hand that was there. No hand is invented.
+5. **Missing.** Bursts of frames lose a hand that was there: its score is 0. No hand is invented.
 6. **Swaps.** Bursts of frames take each hand for the other: what was left is stored as right,
-   turned half around so that palm and fingers point where they did.
+   turned half around so that palm and fingers point where they did; score and ``filled`` with it.
 
 Field of view, shape, text and times are kept. The law: with all sizes 0 and the scale 1, the
 episode comes back as it was.
@@ -22,7 +22,7 @@ episode comes back as it was.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,7 @@ from mint_hub.synth.hand_anatomy import straight_axes
 __all__ = ["TeacherNoise", "teacher_noise"]
 
 Floats = NDArray[np.float64]
+N = TypeVar("N", bound=np.generic)
 
 _TURN_AROUND: Final = np.stack(
     [
@@ -125,7 +126,15 @@ def teacher_noise(episode: Episode, seed: int, settings: TeacherNoise | None = N
     camera = _camera(episode, size, scale, rng)
     state, outlying = _hands(episode, size, rng)
     presence, missing = _missing(episode, size, rng)
-    state, presence, score, swapped = _swapped(episode, state, presence, size, rng)
+    score, filled = episode.presence_score, episode.filled
+    if score is not None:
+        score = np.where(missing, np.float32(0), score)
+    if filled is not None:
+        filled = filled & presence
+    swapped = _bursts(rng, episode.num_frames, size.swaps_per_s / episode.fps, size.swap_frames)
+    swapped &= presence.any(1)
+    state = np.where(swapped[:, None, None], _taken_for_the_other(state), state)
+    presence = _exchanged(presence, swapped)
     state = np.where(presence[..., None], state, hands.absent(presence.shape))
     status = "pseudo: path enlarged" if size != TeacherNoise.none() else None
     meta: dict[str, Any] = {
@@ -146,8 +155,8 @@ def teacher_noise(episode: Episode, seed: int, settings: TeacherNoise | None = N
         T_camera_from_world=camera,
         hand_state=state.astype(np.float32),
         presence=presence,
-        presence_score=score,
-        filled=None if episode.filled is None else episode.filled & presence,
+        presence_score=None if score is None else _exchanged(score, swapped),
+        filled=None if filled is None else _exchanged(filled, swapped),
         meta=meta,
     )
 
@@ -214,24 +223,16 @@ def _missing(
     return episode.presence & ~lost, missing
 
 
-def _swapped(
-    episode: Episode,
-    state: Floats,
-    presence: NDArray[np.bool_],
-    size: TeacherNoise,
-    rng: np.random.Generator,
-) -> tuple[Floats, NDArray[np.bool_], NDArray[np.float32] | None, NDArray[np.bool_]]:
-    """States, presence and scores with sides swapped in some frames, and those frames (T,)."""
-    swap = _bursts(rng, episode.num_frames, size.swaps_per_s / episode.fps, size.swap_frames)
-    swap &= presence.any(1)
+def _taken_for_the_other(state: Floats) -> Floats:
+    """States (T, 2, 109) of each hand stored as the other, palm and fingers where they were."""
     other = hands.unpack(state[:, [RIGHT, LEFT]])
     turned = np.asarray(other.orientation()) @ _TURN_AROUND
-    mirrored = replace(other, orientation_rot6d_rows=matrix_to_rot6d_rows(turned)).pack()
-    state = np.where(swap[:, None, None], mirrored, state)
-    score = episode.presence_score
-    if score is not None:
-        score = np.where(swap[:, None], score[:, [RIGHT, LEFT]], score)
-    return state, np.where(swap[:, None], presence[:, [RIGHT, LEFT]], presence), score, swap
+    return np.asarray(replace(other, orientation_rot6d_rows=matrix_to_rot6d_rows(turned)).pack())
+
+
+def _exchanged(array: NDArray[N], frames: NDArray[np.bool_]) -> NDArray[N]:
+    """(T, 2) with the two hands exchanged in ``frames`` (T,)."""
+    return np.where(frames[:, None], array[:, [RIGHT, LEFT]], array)
 
 
 def _half_smooth(rng: np.random.Generator, shape: tuple[int, ...], frames: float = 10.0) -> Floats:

@@ -8,6 +8,8 @@ import pytest
 from mint_hub.geometry.hand_state import unpack
 from mint_hub.synth.activities import TRAIN
 from mint_hub.synth.activities_ood import OOD
+from mint_hub.synth.episodes import presence_of
+from mint_hub.synth.frozen import require_frozen
 from mint_hub.synth.presets import (
     BENCH_CLIPS,
     PRESETS,
@@ -15,6 +17,7 @@ from mint_hub.synth.presets import (
     fingerprint,
     fingerprint_of,
     is_bench,
+    rng_of,
     seed_of,
 )
 from mint_hub.synth.scene import make_world
@@ -80,6 +83,43 @@ def test_bench_clips_are_refused_in_any_form(preset, number):
     assert is_bench(episode)
     assert is_bench(episode.window(3, 5))
     assert is_bench(teacher_noise(episode, 4).window(0, 6))
+
+
+def test_other_labels_of_a_bench_clip_are_known_by_its_name():
+    other = make_episode(4, seed=2, key="synth-bench-ood-1f")
+    assert is_bench(other)
+    assert is_bench(dataclasses.replace(other, key="a", meta={"uid": "synth-bench-3"}))
+    assert not is_bench(dataclasses.replace(other, key="synth-train-3"))
+
+
+@pytest.mark.parametrize(("preset", "number"), [("bench", 5), ("bench-ood", 22)])
+def test_benches_are_what_was_frozen(preset, number):
+    world = make_world(number, preset)
+    presence = presence_of(world)
+    made = make_episode(world.num_frames, seed=1, key=world.key)
+    episode = dataclasses.replace(
+        made,
+        T_camera_from_world=world.T_camera_from_world,
+        fov_vh_rad=np.tile(np.asarray(world.fov_vh_rad, np.float32), (world.num_frames, 1)),
+        hand_state=world.hands.hand_state,
+        presence=presence,
+        presence_score=None,
+    )
+    require_frozen(preset, number, episode)
+    moved = world.T_camera_from_world.copy()
+    moved[10, 0, 3] += 0.01
+    with pytest.raises(ValueError, match=f"{preset}/{number}: expected the clip of generator"):
+        require_frozen(preset, number, dataclasses.replace(episode, T_camera_from_world=moved))
+    with pytest.raises(ValueError, match="expected the clip of generator"):
+        require_frozen(preset, number, episode.window(0, world.num_frames - 1))
+
+
+def test_streams_of_a_clip_are_apart():
+    """Also those of small seeds, whose words numpy would pad with zeros."""
+    for seed in (0, 3, 1 << 40):
+        first = [rng_of("train", seed, *more).random() for more in ((), (0,), (1,), (7,))]
+        assert len(set(first)) == 4
+    assert rng_of("train", 3).random() != rng_of("bench", 3).random()
 
 
 def test_a_bench_clip_is_known_by_its_meta_alone():

@@ -16,7 +16,7 @@ from mint_hub.synth.collisions import collisions
 from mint_hub.synth.hand_pose import HandProxy
 from mint_hub.synth.motion import PoseTrack
 from mint_hub.synth.person import Person
-from mint_hub.synth.presets import PRESETS
+from mint_hub.synth.presets import PRESETS, seed_of
 from mint_hub.synth.room import standing
 from mint_hub.synth.scene import make_world
 from mint_hub.synth.tabletop import Tabletop
@@ -144,18 +144,32 @@ def test_benches_move_enough(preset):
 
 
 def test_sizes_do_not_tell_each_other():
-    made = [make_world(seed, "train", 1).meta for seed in range(30)]
+    made = [make_world(seed_of("train", 0, n), "train", 1) for n in range(20)]
+    made += [make_world(n, "bench", 1) for n in range(20)]
     names = ("table_height_m", "eye_above_table_m", "hand_size")
-    for a, b in combinations(names, 2):
-        correlation = np.corrcoef([m[a] for m in made], [m[b] for m in made])[0, 1]
-        assert abs(correlation) < 0.5
+    sizes = {name: [w.meta[name] for w in made] for name in names}
+    sizes["things"] = [
+        float(np.mean([np.ptp(b.mesh.vertices, axis=0).max() for b in w.bodies if b.is_object()]))
+        for w in made
+    ]
+    for a, b in combinations(sizes, 2):
+        assert abs(np.corrcoef(sizes[a], sizes[b])[0, 1]) < 0.4, (a, b)
+
+
+def test_heads_do_not_whirl():
+    for number in range(4):
+        world = make_world(seed_of("train", 3, number), "train", 150)
+        R = world.T_camera_from_world[:, :3, :3]
+        assert np.rad2deg(geodesic_angle(R[1:], R[:-1])).max() * world.fps < 220
 
 
 def test_bad_arguments_are_named():
     with pytest.raises(ValueError, match="preset: expected one of"):
         make_world(0, "val")
-    with pytest.raises(ValueError, match="seed: expected 0 to 40 for bench, got 40"):
+    with pytest.raises(ValueError, match="seed: expected 0 to 39 for bench, got 40"):
         make_world(40, "bench")
+    with pytest.raises(ValueError, match="seed: expected 0 or more for train, got -1"):
+        make_world(-1, "train")
     with pytest.raises(ValueError, match="num_frames"):
         make_world(0, "train", 0)
 
