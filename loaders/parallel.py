@@ -17,6 +17,9 @@ T = TypeVar("T")
 _function: Callable[[Any], Any] | None = None
 """What this process does with every item; set in worker processes only."""
 
+_left: Any = None
+"""Shared by all: its ``value`` is true once nobody waits for results; set in workers only."""
+
 
 def in_order(
     function: Callable[[Any], T],
@@ -28,7 +31,8 @@ def in_order(
     """Yield ``function(item)`` for every item, in their order, whatever the number of processes.
 
     Items are taken a few batches ahead of the reader, never all at once. ``function`` travels to
-    each process once. Processes end with the generator, and also when their parent is killed. They
+    each process once. Processes end with the generator, and also when their parent is killed: one
+    that is closed, or that raises, waits for the items in hand and leaves those that wait. They
     start as Python has it by default, or as ``start`` says: what holds threads or graphics must
     not be forked.
 
@@ -43,22 +47,28 @@ def in_order(
     waiting: deque[Future[list[T]]] = deque()
     try:
         context = multiprocessing.get_context(start)
-        with ProcessPoolExecutor(num_procs, context, _begin, (function,)) as pool:
-            while part := list(islice(stream, batch)):
-                waiting.append(pool.submit(_do, part))
-                if len(waiting) > 2 * num_procs:
+        # Without a lock, which a process that dies could keep. The pool could not cancel these: all
+        # that wait here are in its queue to the processes.
+        left: Any = context.RawValue("b", 0)
+        with ProcessPoolExecutor(num_procs, context, _begin, (function, left)) as pool:
+            try:
+                while part := list(islice(stream, batch)):
+                    waiting.append(pool.submit(_do, part))
+                    if len(waiting) > 2 * num_procs:
+                        yield from waiting.popleft().result()
+                while waiting:
                     yield from waiting.popleft().result()
-            while waiting:
-                yield from waiting.popleft().result()
+            finally:
+                left.value = 1
     except BrokenProcessPool:
         raise CorpusError(
             "a worker process died (out of memory?): call again, with a lower num_procs"
         ) from None
 
 
-def _begin(function: Callable[[Any], Any]) -> None:
-    global _function
-    _function = function
+def _begin(function: Callable[[Any], Any], left: Any) -> None:
+    global _function, _left
+    _function, _left = function, left
     threading.Thread(target=_leave_with_parent, daemon=True).start()
 
 
@@ -71,4 +81,4 @@ def _leave_with_parent() -> None:
 
 def _do(items: list[Any]) -> list[Any]:
     assert _function is not None
-    return [_function(item) for item in items]
+    return [_function(item) for item in items if not _left.value]

@@ -37,6 +37,15 @@ class Indexed(Protocol):
 
 
 @runtime_checkable
+class Keyed(Protocol):
+    """Indexed episodes whose keys are known without reading or making them."""
+
+    def key(self, i: int, /) -> str:
+        """Return the key of episode ``i``."""
+        ...
+
+
+@runtime_checkable
 class Sliced(Protocol):
     """A stream of episodes in slices: iterates small descriptions, each read in any process.
 
@@ -81,8 +90,9 @@ def encoded_samples(
 ) -> Generator[EncodedSample]:
     """Yield the samples of a split in its order, but those ``written`` already, over processes.
 
-    The samples are the same for any number of processes. Of indexed episodes only the ends of what
-    is written are compared; streams are read through it.
+    The samples are the same for any number of processes. What is written is compared by key: all of
+    it where the episodes are ``Keyed``, of others that are indexed only its ends, which are read;
+    streams are read through it.
 
     Raises:
         CorpusError: what is written is not what these episodes begin with; a process died.
@@ -94,8 +104,13 @@ def encoded_samples(
         places = iter(Order(len(made), spec.seed).permute(0, np.arange(len(made))).tolist())
         ends = (0, len(written) - 1)
         for number, key in enumerate(written):
-            place = next(places, None)
-            got = None if place is None else made[place].key if number in ends else key
+            place, got = next(places, None), key
+            if place is None:
+                got = None
+            elif isinstance(made, Keyed):
+                got = made.key(place)
+            elif number in ends:
+                got = made[place].key
             _check_written(number, key, got)
         yield from in_order(_ReadAndEncode(made, encoder), places, num_procs)
     elif isinstance(made, Sliced):

@@ -15,7 +15,7 @@ import hashlib
 import logging
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -106,6 +106,7 @@ def write_corpus(
     progress: bool = False,
     extra_members: ExtraMembers | None = None,
     shuffle_buffer: int = 512,
+    made_with: Mapping[str, Any] | None = None,
 ) -> CorpusReport:
     """Write one split, ``folder/config/split``, or go on where an interrupted call stopped.
 
@@ -125,6 +126,8 @@ def write_corpus(
         progress: show a bar, where there is a terminal.
         extra_members: gives further members of an episode, such as ``mp4``, by name.
         shuffle_buffer: episodes that a stream is shuffled through.
+        made_with: arguments, by name and JSON-able, that the episodes are made with and their keys
+            do not tell: an unfinished split that was begun with others is refused.
 
     Raises:
         CorpusError: the split exists; an unfinished one was begun with other arguments or episodes;
@@ -138,7 +141,7 @@ def write_corpus(
         raise ValueError(f"num_procs: expected a whole number of at least 1, got {num_procs!r}")
     spec = ShardSpec(config, split, format, extra, shard_bytes, seed, shuffle_buffer)
     final = Path(folder) / config / split
-    work = UnfinishedSplit(final.with_name(f".{split}.partial"), spec)
+    work = UnfinishedSplit(final.with_name(f".{split}.partial"), spec, made_with or {})
     if final.exists():
         if work.folder.exists() and not work.files.exists():  # died after the very last step
             shutil.rmtree(work.folder)

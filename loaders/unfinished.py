@@ -5,11 +5,13 @@ the split; and, beside it, a sealed record of every shard. A shard counts when i
 and its sha256 is the recorded one.
 """
 
+import json
 import os
 import shutil
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from mint_hub.loaders.fields import KEY_PATTERN
 from mint_hub.loaders.manifest import (
@@ -24,6 +26,7 @@ from mint_hub.loaders.tar_layout import SUFFIX, CorpusError
 
 SHARD_BYTES: Final = 64 << 20
 _SPEC: Final = "spec.json"
+_MADE_WITH: Final = "made_with"
 
 
 @dataclass(frozen=True)
@@ -60,10 +63,15 @@ class ShardSpec:
 
 @dataclass
 class UnfinishedSplit:
-    """The unfinished split: ``files/`` becomes the split; beside it, a record of each shard."""
+    """The unfinished split: ``files/`` becomes the split; beside it, a record of each shard.
+
+    ``made_with`` are the arguments that the episodes are made with, by name, where they are made
+    while they are written: keys alone do not tell clips of one seed apart.
+    """
 
     folder: Path
     spec: ShardSpec
+    made_with: Mapping[str, Any] = field(default_factory=dict[str, Any])
     shards: list[ShardRecord] = field(default_factory=list[ShardRecord])
     shard_keys: list[list[str]] = field(default_factory=list[list[str]])
     members: tuple[str, ...] = ()
@@ -78,17 +86,19 @@ class UnfinishedSplit:
         return [key for keys in self.shard_keys for key in keys]
 
     def resume(self, length: int | None) -> int:
-        """Take over shards that are finished and whole, remove all else; return how many."""
+        """Take over shards that are finished and whole, remove all else; return how many.
+
+        Raises:
+            CorpusError: it was begun with other arguments; names the first, expected and got.
+
+        """
         self.files.mkdir(parents=True, exist_ok=True)
-        began = {**asdict(self.spec), "num_episodes": length}
+        began = {**asdict(self.spec), "num_episodes": length, _MADE_WITH: dict(self.made_with)}
         if (self.folder / _SPEC).exists() and any(self.files.glob(f"*{SUFFIX}")):
             was = read_sealed(self.folder / _SPEC)
-            for name, value in began.items():
-                if was.get(name) != value:
-                    raise CorpusError(
-                        f"{self.folder}: expected {name} {was.get(name)!r} as it was begun, got "
-                        f"{value!r}: resume with the same arguments, or delete that folder"
-                    )
+            now: dict[str, Any] = json.loads(json.dumps(began))  # as it would be read
+            self._refuse_others(was.pop(_MADE_WITH, {}), now.pop(_MADE_WITH))
+            self._refuse_others(was, now)
         else:
             write_sealed(self.folder / _SPEC, began)
         while self._take_over(self.spec.shard_name(len(self.shards))):
@@ -97,6 +107,15 @@ class UnfinishedSplit:
         _clear(self.folder, keep)
         _clear(self.files, {s.name for s in self.shards})
         return len(self.shards)
+
+    def _refuse_others(self, was: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+        for name in {**now, **was}:
+            if name not in was or name not in now or was[name] != now[name]:
+                expected, got = (repr(v[name]) if name in v else "none" for v in (was, now))
+                raise CorpusError(
+                    f"{self.folder}: expected {name} {expected} as it was begun, got {got}: "
+                    "resume with the same arguments, or delete that folder"
+                )
 
     def _take_over(self, name: str) -> bool:
         tar = self.files / name

@@ -31,7 +31,8 @@ def add_synth(commands: Any) -> None:
         default=0.0,
         metavar="SHARE",
         help="share of clips, 0 to 1, whose pictures are bent by a lens; labels stay those of the "
-        "pinhole that rectifying with meta synth.lens gives; train only (default: 0)",
+        "pinhole that rectifying with meta synth.lens gives, as training does; train only "
+        "(default: 0)",
     )
     add("--depth", action="store_true", help="also store depth")
     add("--segmentation", action="store_true", help="also store segments")

@@ -43,7 +43,7 @@ from mint_hub.synth.lensing import (
     require_share,
     seen_through,
 )
-from mint_hub.synth.presets import GENERATOR, REVISION, preset_named, rng_of, seed_of
+from mint_hub.synth.presets import GENERATOR, REVISION, key_of, preset_named, rng_of, seed_of
 from mint_hub.synth.render import Rendered, Renderer
 from mint_hub.synth.scene import make_world
 from mint_hub.synth.world import World
@@ -405,7 +405,7 @@ class _Clips:
         return clip.episode
 
     def key(self, i: int, /) -> str:
-        return f"synth-{self._maker.preset}-{self._seeds[i]:x}"
+        return key_of(self._maker.preset, self._seeds[i])
 
     def members_of(self, episode: Episode) -> dict[str, bytes]:
         return self._members[episode.key]

@@ -39,6 +39,7 @@ __all__ = [
     "fingerprint",
     "fingerprint_of",
     "is_bench",
+    "key_of",
     "on_grid",
     "preset_named",
     "rng_of",
@@ -161,6 +162,11 @@ def seed_of(preset: str, seed: int, number: int) -> int:
     drawn = int.from_bytes(hashlib.sha256(f"{seed}:{number}".encode()).digest()[:6], "big")
     assert drawn < RESERVED_SEEDS
     return drawn
+
+
+def key_of(preset: str, seed: int) -> str:
+    """Key of the episode of a seed."""
+    return f"synth-{preset}-{seed:x}"
 
 
 def rng_of(preset: str, seed: int, *more: int) -> np.random.Generator:

@@ -32,6 +32,7 @@ from mint_hub.synth.presets import (
     REVISION,
     SHAPE_STEPS,
     Preset,
+    key_of,
     on_grid,
     preset_named,
     rng_of,
@@ -290,7 +291,7 @@ def _film(
     exposure = np.clip(drift * rng.uniform(0.8, 1.2), 0.5, 1.7)
     moved = tuple(Body(b.mesh, T_world_from_work @ b.T_world_from_body, b.movable) for b in bodies)
     return World(
-        key=f"synth-{preset.name}-{seed:x}",
+        key=key_of(preset.name, seed),
         bodies=moved,
         lights=lights(rng),
         hands=Hands(

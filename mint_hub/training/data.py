@@ -29,11 +29,12 @@ from mint_hub.loaders.order import Order
 from mint_hub.loaders.packing import packed_images
 from mint_hub.loaders.resolvers import Videos
 from mint_hub.loaders.schema import Episode
+from mint_hub.synth.undo_lens import undo_lens
 from mint_hub.training.augment import Augmentation
 from mint_hub.training.clips import ClipRow, DataError, Split, Survey
 from mint_hub.training.normalisation import CameraScales, CameraSums, reanchored, window_starts
 from mint_hub.training.order import MixtureOrder, group_weights
-from mint_hub.training.pixels import PixelCache, resized
+from mint_hub.training.pixels import PixelCache, filter_of, resized
 from mint_hub.training.recipes import Presence
 from mint_hub.training.views import OVERSIZE, ViewAugmentation
 from mint_hub.windows import WINDOW_LENGTH
@@ -177,10 +178,11 @@ class TrainingWindows:
         return self.splits[split].episode(i).window(start, self.settings.length)
 
     def pictures(self, number: int) -> NDArray[np.uint8]:
-        """Decode the pictures of a window, (T, H, W, 3) uint8 RGB.
+        """Decode the pictures of a window, (T, H, W, 3) uint8 RGB, in the geometry of its labels.
 
         Raises:
             VideoError: a clip that is damaged, missing, or of another length than its episode.
+            ValueError: pictures of another size than their lens's.
 
         """
         at, i, start = (int(n) for n in self.places[number])
@@ -189,7 +191,7 @@ class TrainingWindows:
             assert self.settings.videos is not None
             video = VideoAttachment(split.reader[i], self.settings.videos)
             return video.window(start, length).images
-        return packed_images(split.reader, i, start, length)
+        return undo_lens(packed_images(split.reader, i, start, length), split.episode(i))
 
     def resized(self, number: int, size_hw: tuple[int, int]) -> NDArray[np.uint8]:
         """Return the pictures of a window at a size, (T, h, w, 3), kept ones where there are any.
@@ -250,12 +252,12 @@ class TrainingWindows:
         from tqdm.auto import tqdm
 
         caches: dict[int, PixelCache] = {}
-        video: Any = self.processor.video_processor
         for at, split in enumerate(self.splits):
             if not split.packed:
                 continue
             size_hw = self.read_size_hw(views)
-            cache = PixelCache(folder, split.folder, size_hw, f"resample {int(video.resample)}")
+            made = filter_of(split.reader, self.processor)
+            cache = PixelCache(folder, split.folder, size_hw, made)
             caches[at] = cache
             if not cache.made():
                 with tqdm(total=len(split.reader), disable=not progress, desc=split.name) as bar:

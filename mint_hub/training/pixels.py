@@ -2,7 +2,7 @@
 
 ``pixels-HASH.npy`` is uint8 (frames of all episodes one after another, H, W, 3). Its name is the
 hash of the split's videos and of the size, so that it serves every run on the same data. What is
-read from it equals what decoding gives, bit for bit.
+read from it equals what decoding gives, bit for bit. Lenses of synthetic clips are undone.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from mint_hub.loaders.atomic import clear_left_over, replacing
 from mint_hub.loaders.manifest import read_manifest
 from mint_hub.loaders.packing import packed_images
 from mint_hub.loaders.reader import CorpusReader
+from mint_hub.synth.undo_lens import lens_of, undo_lens
 
-__all__ = ["PixelCache", "resized"]
+__all__ = ["PixelCache", "filter_of", "resized"]
 
 Images = NDArray[np.uint8]
 
@@ -40,6 +41,12 @@ def resized(images: Images, processor: Any, size_hw: tuple[int, int]) -> Images:
     return made.permute(0, 2, 3, 1).contiguous().numpy()
 
 
+def filter_of(reader: CorpusReader, processor: Any) -> str:
+    """Name how pictures of a split are made: how resized, and whether lenses are undone."""
+    bent = any(lens_of(reader[i]) is not None for i in range(len(reader)))
+    return f"resample {int(processor.video_processor.resample)}" + (", lens undone" if bent else "")
+
+
 @dataclass(frozen=True)
 class PixelCache:
     """The pictures of one packed split at one size.
@@ -48,7 +55,7 @@ class PixelCache:
         folder: where the file lies.
         split: folder of the split, ``CORPUS/CONFIG/SPLIT``.
         size_hw: (h, w) of the pictures.
-        filter: how they are resized, by name: part of the file's name.
+        filter: how they are made, by name (see `filter_of`): part of the file's name.
 
     """
 
@@ -73,6 +80,7 @@ class PixelCache:
 
         Raises:
             VideoError: a clip that is damaged, missing, or of another length than its episode.
+            ValueError: pictures of another size than their lens's.
             OSError: no room for the file.
 
         """
@@ -82,7 +90,8 @@ class PixelCache:
             file = np.lib.format.open_memmap(temporary, "w+", np.uint8, shape)
             at = 0
             for i in range(len(reader)):
-                images = resized(packed_images(reader, i), processor, self.size_hw)
+                images = undo_lens(packed_images(reader, i), reader[i])
+                images = resized(images, processor, self.size_hw)
                 file[at : at + len(images)] = images
                 at += len(images)
                 yield i + 1

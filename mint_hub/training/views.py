@@ -67,18 +67,20 @@ class View:
     def episode(self, episode: Episode) -> Episode:
         """Change labels alike; hands that a crop leaves outside the picture are not present."""
         poses, state = episode.T_camera_from_world, episode.hand_state
-        presence, score = episode.presence, episode.presence_score
+        presence, score, filled = episode.presence, episode.presence_score, episode.filled
         if self.mirror:
             mirror = np.eye(4)
             mirror[:3, :3] = _MIRROR
             poses = mirror @ poses @ mirror
             state, presence = _mirrored(state), presence[:, ::-1]
             score = None if score is None else score[:, ::-1]
+            filled = None if filled is None else filled[:, ::-1]
         fov = 2 * np.arctan(self.zoom * np.tan(np.asarray(episode.fov_vh_rad, float) / 2))
         if self.zoom < 1:
             presence = presence & _inside(state, fov, episode.image_size_hw)
             state = np.where(presence[..., None], state, hands.absent(presence.shape))
             score = None if score is None else score * presence
+            filled = None if filled is None else filled & presence
         return replace(
             episode,
             T_camera_from_world=poses,
@@ -86,6 +88,7 @@ class View:
             hand_state=np.ascontiguousarray(state, np.float32),
             presence=np.ascontiguousarray(presence),
             presence_score=None if score is None else np.ascontiguousarray(score, np.float32),
+            filled=None if filled is None else np.ascontiguousarray(filled),
         )
 
 

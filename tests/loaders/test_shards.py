@@ -3,14 +3,17 @@ import os
 import signal
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import psutil
 import pytest
 
-from mint_hub.loaders import members, shards
+from mint_hub.loaders import members, parallel, shards
 from mint_hub.loaders.index import Index
 from mint_hub.loaders.integrity import verify
 from mint_hub.loaders.manifest import read_manifest, split_folders
@@ -248,6 +251,52 @@ def test_other_arguments_or_episodes_do_not_resume(tmp_path):
     assert write(EPISODES, tmp_path).kept_shards == 2
 
 
+def test_keys_that_are_known_are_compared_without_reading(tmp_path, whole):
+    class Keyed(list):
+        read: ClassVar[list[int]] = []
+
+        def __getitem__(self, i):
+            self.read.append(i)
+            return super().__getitem__(i)
+
+        def key(self, i, /):
+            return EPISODES[i].key
+
+    _stop_in_the_last_shard(tmp_path)
+    order = Order(len(EPISODES), 0).permute(0, range(len(EPISODES))).tolist()
+    others = Keyed(EPISODES)
+    others.key = lambda i: "f-1" if i == order[1] else EPISODES[i].key  # neither end
+    with pytest.raises(CorpusError, match=r"episode 1 .* got 'f-1'"):
+        write(others, tmp_path)
+    assert write(Keyed(EPISODES), tmp_path).kept_shards == 2
+    assert sorted(Keyed.read) == sorted(order[-len(Keyed.read) :])
+    assert len(Keyed.read) < len(order)
+    assert tree(tmp_path) == whole
+
+
+def test_what_episodes_are_made_with_is_part_of_what_is_begun(tmp_path, whole):
+    class Breaks(list):
+        def __iter__(self):
+            yield from EPISODES[:-1]
+            raise RuntimeError("unplugged")
+
+    def made(frames, source=EPISODES):
+        return write(iter(source), tmp_path, made_with=frames, shuffle_buffer=1)
+
+    with pytest.raises(RuntimeError, match="unplugged"):
+        made({"frames": 3, "size": (1, 2)}, Breaks())
+    for other, message in (
+        ({"frames": 4, "size": (1, 2)}, "frames 3 as it was begun, got 4"),
+        ({"frames": 3}, r"size \[1, 2\] as it was begun, got none"),
+        ({"frames": 3, "size": (1, 2), "seed": 0}, "seed none as it was begun, got 0"),
+    ):
+        with pytest.raises(CorpusError, match=f"expected {message}: resume with the same"):
+            made(other)
+    report = made({"size": [1, 2], "frames": 3.0})
+    assert report.kept_shards == 2
+    assert "made_with" not in read_manifest(report.folder).spec
+
+
 def test_processes_end_with_a_killed_writer(tmp_path):
     code = (
         "import sys, time\n"
@@ -338,6 +387,27 @@ def test_items_are_taken_a_few_batches_ahead_only(num_procs):
     assert next(results) == 0
     assert len(taken) <= 2 * (2 * num_procs + 1)
     results.close()
+
+
+def _wait_from_1_on(folder: Path, item: int) -> int:
+    (folder / f"begun-{item}").touch()
+    while item and not (folder / "go").exists():
+        time.sleep(0.01)
+    return item
+
+
+def test_items_that_wait_are_left_when_the_results_are(tmp_path, monkeypatch):
+    class Pool(ProcessPoolExecutor):
+        def __exit__(self, *error):
+            (tmp_path / "go").touch()
+            return super().__exit__(*error)
+
+    monkeypatch.setattr(parallel, "ProcessPoolExecutor", Pool)
+    results = in_order(partial(_wait_from_1_on, tmp_path), range(9), 2, batch=1)
+    assert next(results) == 0
+    results.close()
+    begun = {path.name for path in tmp_path.glob("begun-*")}
+    assert begun <= {"begun-0", "begun-1", "begun-2"}  # of five that were handed out
 
 
 def test_an_error_in_a_process_arrives_and_a_death_is_told():

@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import re
 import sys
 
 import cv2
@@ -18,12 +19,16 @@ from mint_hub.loaders.clips import PackedClip
 from mint_hub.loaders.integrity import verify
 from mint_hub.loaders.packing import pixel_window
 from mint_hub.loaders.reader import CorpusReader
+from mint_hub.loaders.shards import CorpusError
 from mint_hub.synth import episodes
 from mint_hub.synth.corruption import Corruption
-from mint_hub.synth.episodes import DEPTH_STEP_M, make_episode, presence_of, synthesise
-from mint_hub.synth.presets import is_bench
+from mint_hub.synth.episodes import DEPTH_STEP_M, Clip, make_episode, presence_of, synthesise
+from mint_hub.synth.presets import is_bench, seed_of
 from mint_hub.synth.render import Renderer
 from mint_hub.synth.scene import make_world
+from tests.corpus_faults import tree
+from tests.episodes import make_episode as make_labels
+from tests.small_world import SIZE_HW, small_world, two_hands
 
 FRAMES = 6
 TIPS = np.array([name.endswith("tip") for name in KEYPOINT_NAMES])
@@ -69,6 +74,24 @@ def test_presence_score_is_the_visible_share(drawn):
     assert not clip.episode.presence_score[~clip.episode.presence].any()
 
 
+def test_a_hand_whose_skin_alone_is_in_the_picture_has_no_score(renderer):
+    """A flat hand moved up until its last joint is a third of a pixel above the picture."""
+    world = small_world(1)
+    flat = two_hands(world.T_camera_from_world, "flat")
+    state = flat.hand_state.copy()
+    K = np.asarray(fov_vh_to_K(np.asarray(world.fov_vh_rad), SIZE_HW))
+    joints = np.asarray(HandModel.template().keypoints(state.astype(float)))[0, 1]
+    state[0, 1, 1] += ((-0.3 - K[1, 2]) / K[1, 1] * joints[:, 2] - joints[:, 1]).min()
+    world = dataclasses.replace(world, hands=dataclasses.replace(flat, hand_state=state))
+    visible = renderer.visible_fraction(world, 0)
+    assert (visible > 0).all()  # the skin of both is in the picture
+    episode = make_episode(world, renderer, corruption=Corruption()).episode
+    assert episode.presence.tolist() == [[True, False]]
+    assert episode.presence_score[0, 1] == 0
+    assert episode.presence_score[0, 0] == pytest.approx(visible[0])
+    assert episode.presence_score.dtype == np.float32
+
+
 def test_members_are_the_frames(drawn, world):
     clip, frames, _, _ = drawn
     assert set(clip.members) == {"mp4", "depth.npz", "segmentation.npz"}
@@ -87,7 +110,7 @@ def test_members_are_the_frames(drawn, world):
     assert np.array_equal(segments, np.stack([f.segmentation for f in frames]))
 
 
-@pytest.fixture(scope="module", params=[("bench", 3), ("bench-ood", 5), ("train", 33)])
+@pytest.fixture(scope="module", params=[("bench", 3), ("bench-ood", 6), ("train", 33)])
 def made(request, renderer):
     """A world as it is made, what is drawn of it, and each hand drawn alone."""
     preset, seed = request.param
@@ -188,22 +211,75 @@ def test_shards_read_like_any_other(corpus):
     assert reader[1].meta["scale_status"] == "exact (synthetic)"
 
 
-def test_an_interrupted_run_goes_on_and_ends_the_same(corpus, tmp_path, monkeypatch):
-    made = episodes.make_clip
-    calls: list[int] = []
+class Maker:
+    """Stands for ``make_clip``: labels alone, one clip a shard; interrupted at seed ``stop``."""
 
-    def dies(seed, *args, **options):
-        calls.append(seed)
-        if len(calls) == 2:
+    def __init__(self, stop: int | None = None) -> None:
+        self.stop, self.seeds = stop, list[int]()
+
+    def __call__(self, seed: int, preset: str, *_: object, **__: object) -> Clip:
+        self.seeds.append(seed)
+        if seed == self.stop:
             raise KeyboardInterrupt
-        return made(seed, *args, **options)
+        return Clip(make_labels(3, key=f"synth-{preset}-{seed:x}"), {"mp4": b"%d" % seed})
 
-    monkeypatch.setattr(episodes, "make_clip", dies)
-    with pytest.raises(KeyboardInterrupt):
-        synthesise(tmp_path, "train", 2, seed=1, num_frames=3)
-    synthesise(tmp_path, "train", 2, seed=1, num_frames=3)
-    one, two = (next((f / "synth-train" / "train").glob("*.tar")) for f in (corpus, tmp_path))
-    assert one.read_bytes() == two.read_bytes()
+
+@pytest.fixture
+def begun(renderer, tmp_path, monkeypatch):
+    """Make runs of four clips, of train and of the bench, that stop at the fourth."""
+    monkeypatch.setattr(episodes, "SHARD_BYTES", 1)
+    for preset in ("train", "bench"):
+        monkeypatch.setattr(episodes, "make_clip", Maker(stop=seed_of(preset, 1, 3)))
+        with pytest.raises(KeyboardInterrupt):
+            synthesise(tmp_path, preset, 4, seed=1, num_frames=3)
+    monkeypatch.setattr(episodes, "make_clip", Maker())
+    return tmp_path
+
+
+@pytest.mark.parametrize(("preset", "seed"), [("train", 1), ("bench", 2)])
+def test_an_interrupted_run_goes_on_with_the_clips_that_are_missing(
+    begun, tmp_path_factory, preset, seed
+):
+    """A bench's clips are the same for every seed, and 1 is the scale 1.0."""
+    report = synthesise(begun, preset, 4, seed=seed, num_frames=3, scale=1)
+    assert (report.kept_shards, report.num_shards) == (2, 4)  # the third was still open
+    assert episodes.make_clip.seeds == [seed_of(preset, 1, n) for n in (2, 3)]
+    whole = tmp_path_factory.mktemp("whole")
+    synthesise(whole, preset, 4, seed=1, num_frames=3)
+    split = report.folder.relative_to(begun)
+    assert tree(begun / split) == tree(whole / split)
+
+
+def test_keys_are_those_of_the_clips(corpus):
+    reader = CorpusReader(corpus, "synth-train", "train")
+    keys = [f"synth-train-{seed_of('train', 1, n):x}" for n in range(2)]
+    assert [episode.key for episode in reader] == keys
+
+
+@pytest.mark.parametrize(
+    ("preset", "other", "message"),
+    [
+        ("train", {"num_frames": 4}, "num_frames 3 as it was begun, got 4"),
+        ("train", {"num_frames": None}, "num_frames 3 as it was begun, got None"),
+        ("train", {"scale": 0.5}, "scale 1.0 as it was begun, got 0.5"),
+        ("train", {"lens": 0.5}, "lens 0.0 as it was begun, got 0.5"),
+        ("train", {"depth": True}, "depth False as it was begun, got True"),
+        ("train", {"segmentation": True}, "segmentation False as it was begun, got True"),
+        ("train", {"seed": 2}, "seed 1 as it was begun, got 2"),
+        ("bench", {"scale": 0.5}, "scale 1.0 as it was begun, got 0.5"),
+    ],
+)
+def test_other_arguments_do_not_go_on(begun, preset, other, message):
+    before = tree(begun)
+    with pytest.raises(CorpusError, match=f"{re.escape(message)}: resume with the same arguments"):
+        synthesise(begun, preset, 4, **{"seed": 1, "num_frames": 3, **other})
+    assert tree(begun) == before
+
+
+def test_another_generator_does_not_go_on(begun, monkeypatch):
+    monkeypatch.setattr(episodes, "REVISION", episodes.REVISION + 1)
+    with pytest.raises(CorpusError, match="expected revision"):
+        synthesise(begun, "train", 4, seed=1, num_frames=3)
 
 
 def test_processes_do_not_matter(corpus, tmp_path):
@@ -284,6 +360,7 @@ def test_what_is_missing_is_one_line(module, message, tmp_path, capsys, monkeypa
     said = capsys.readouterr().err.strip()
     assert message in said
     assert "\n" not in said
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_command_line_bends_pictures(renderer, tmp_path):

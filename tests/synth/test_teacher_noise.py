@@ -23,8 +23,14 @@ def episode():
     presence = np.ones((150, 2), bool)
     presence[40:60, 0] = False
     state = np.where(presence[..., None], state, hands.absent((150, 2)))
+    filled = np.zeros((150, 2), bool)
+    filled[70:80, 1] = True
     return replace(
-        made, hand_state=state, presence=presence, presence_score=presence.astype(np.float32)
+        made,
+        hand_state=state,
+        presence=presence,
+        presence_score=np.where(presence, np.float32(0.8), 0),
+        filled=filled,
     )
 
 
@@ -91,6 +97,10 @@ def test_hands_are_lost_but_never_invented(episode):
     lost = episode.presence & ~made.presence
     assert made.meta["teacher_noise"]["missing"] == lost.sum()
     assert np.array_equal(made.hand_state[lost], hands.absent((int(lost.sum()),)))
+    assert not made.presence_score[lost].any()
+    assert np.array_equal(made.presence_score[~lost], episode.presence_score[~lost])
+    assert lost[episode.filled].any()
+    assert np.array_equal(made.filled, episode.filled & ~lost)
     kept = made.presence
     assert np.allclose(made.hand_state[kept], episode.hand_state[kept], atol=1e-6)
 
@@ -110,6 +120,7 @@ def test_a_swap_is_its_own_inverse_and_keeps_where_hands_point(episode):
     assert made.meta["teacher_noise"]["swapped"] == 150
     assert np.array_equal(made.presence, episode.presence[:, ::-1])
     assert np.array_equal(made.presence_score, episode.presence_score[:, ::-1])
+    assert np.array_equal(made.filled, episode.filled[:, ::-1])
     both = episode.presence.all(1)
     before, after = (hands.unpack(e.hand_state[both].astype(float)) for e in (episode, made))
     assert np.allclose(after.translation, before.translation[:, ::-1])
@@ -121,6 +132,15 @@ def test_a_swap_is_its_own_inverse_and_keeps_where_hands_point(episode):
     assert teacher_noise(made, 1, always).allclose(
         replace(episode, meta=teacher_noise(made, 1, always).meta), atol=1e-5
     )
+
+
+def test_a_hand_that_is_lost_and_swapped_has_no_score_on_the_other_side(episode):
+    settings = replace(NONE, missing_per_s=1.0, missing_frames=6.0, swaps_per_s=30.0)
+    made = teacher_noise(episode, 3, settings)
+    lost = made.meta["teacher_noise"]["missing"]
+    assert 0 < lost == episode.presence.sum() - made.presence.sum()
+    assert np.array_equal(made.presence_score > 0, made.presence)
+    assert not (made.filled & ~made.presence).any()
 
 
 def test_the_default_is_as_wrong_as_a_cascade(episode):

@@ -15,7 +15,10 @@ MIRROR = np.diag([-1.0, 1.0, 1.0])
 
 
 def episode():
-    return replace(training_episode("e0", 12), image_size_hw=(60, 90))
+    made = replace(training_episode("e0", 12), image_size_hw=(60, 90))
+    filled = made.presence & (np.arange(12) % 3 == 0)[:, None]
+    filled[:, 1] = False
+    return replace(made, filled=filled)
 
 
 def joints_of(ep):
@@ -28,6 +31,7 @@ def test_a_mirrored_window_is_the_mirrored_scene():
     np.testing.assert_allclose(joints_of(after), (joints_of(before) @ MIRROR)[:, ::-1], atol=1e-6)
     np.testing.assert_array_equal(after.presence, before.presence[:, ::-1])
     np.testing.assert_array_equal(after.presence_score, before.presence_score[:, ::-1])
+    np.testing.assert_array_equal(after.filled, before.filled[:, ::-1])
     twice = View(mirror=True).episode(after)
     np.testing.assert_allclose(twice.T_camera_from_world, before.T_camera_from_world, atol=1e-12)
     np.testing.assert_allclose(twice.hand_state, before.hand_state, atol=1e-6)
@@ -70,11 +74,15 @@ def test_hands_outside_a_crop_are_not_present():
     state[..., :3] = [0.0, 0.0, 2.0]
     state[:, 1, 0] = 0.9 * 2.0 * np.tan(before.fov_vh_rad[0, 1] / 2)  # near the picture's border
     seen = np.ones_like(before.presence)
-    before = replace(before, hand_state=state, presence=seen, presence_score=seen * np.float32(0.9))
+    score = seen * np.float32(0.9)
+    before = replace(
+        before, hand_state=state, presence=seen, presence_score=score, filled=seen.copy()
+    )
     after = View(zoom=0.5).episode(before)
     assert after.presence[:, 0].all()
     assert not after.presence[:, 1].any()
     assert (after.presence_score[:, 1] == 0).all()
+    np.testing.assert_array_equal(after.filled, after.presence)
     assert (after.presence_score[:, 0] == np.float32(0.9)).all()
     np.testing.assert_allclose(
         np.tan(after.fov_vh_rad / 2), 0.5 * np.tan(before.fov_vh_rad / 2), rtol=1e-5
