@@ -148,9 +148,10 @@ def _duration(eye: Floats, start: Floats, stop: Floats, least: float, speed: flo
 def _level(ahead: Floats) -> Floats:
     """Rotations (T, 3, 3), camera from workplace, that look along (T, 3) with a level horizon."""
     ahead = ahead / np.linalg.norm(ahead, axis=-1, keepdims=True)
-    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right: Floats = np.cross(ahead, np.array([0.0, 0.0, 1.0]))
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    return np.stack([right, np.cross(ahead, right), ahead], -2)
+    down: Floats = np.cross(ahead, right)
+    return np.stack([right, down, ahead], -2)
 
 
 def median_steps(T_camera_from_work: Floats) -> tuple[float, float]:

@@ -60,8 +60,8 @@ CHOSEN: Final = (
     Chosen("sample-2", 12, 0.6),
     Chosen("sample-3", 17, 0.75),
 )
-"""Jar, block and bottle, in a wide view; close up, with a lively head; a parcel, turns of the head, and a
-hand that leaves the picture."""
+"""Jar, block and bottle, in a wide view; close up, with a lively head; a parcel, turns of the head,
+and a hand that leaves the picture."""
 
 
 def sample_clips() -> Iterator[Clip]:
