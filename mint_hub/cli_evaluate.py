@@ -70,7 +70,7 @@ def _add_benchmark(parser: argparse.ArgumentParser, required: bool = True) -> No
     add("--protocol", choices=("p1", "p2"), default="p2", help="ARCTIC's (default: p2)")
     add("--stream", help="HOT3D's camera (default: 214-1 of Aria, 1201-1 of Quest 3)")
     add("--mano", help="folder with your MANO files: HOT3D's and ARCTIC's hands need them")
-    add("--clip-frames", type=int, help="cut into clips of so many frames (the paper: 81)")
+    add("--clip-frames", type=int, help="cut into clips of so many frames (paper: hands 81)")
     add("--limit", type=int, help="only so many clips, evenly spread")
 
 

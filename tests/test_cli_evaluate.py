@@ -1,6 +1,7 @@
 """The verbs that measure, as a user calls them: labels, a checkpoint, two of either."""
 
 import json
+import shutil
 import sys
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from mint_hub.cli import main
 from mint_hub.evaluation.clips import Source
 from mint_hub.evaluation.predictor import OpenCheckpoint, Predictor
+from mint_hub.evaluation.results import ClipResult, efficiency_of
 from mint_hub.loaders.clips import encode_clip
 from mint_hub.loaders.packing import MP4
 from mint_hub.loaders.shards import write_corpus
@@ -78,6 +80,7 @@ def test_a_checkpoint_is_run_once_and_then_read(corpus, checkpoint, tmp_path, ca
     first = json.loads((tmp_path / "a/results.json").read_text())
     assert first["prediction"]["settings"]["window"] == 8
     assert first["efficiency"]["frames"] == 2 * FRAMES
+    assert [clip["warm_up"] for clip in first["clips"]] == [True, False, False]
     assert len(first["prediction"]["weights"]) == 16
     from mint_hub.inference.runner import MintRunner
 
@@ -104,6 +107,47 @@ def test_weights_have_a_hash_that_follows_them(checkpoint, tmp_path):
         for f in (checkpoint, checkpoint, str(tmp_path))
     )
     assert one == again != two
+
+
+def test_the_hash_is_of_the_model_not_of_the_library(checkpoint, tmp_path, monkeypatch):
+    def hash_of(folder):
+        return OpenCheckpoint(Predictor.of(str(folder), device="cpu")).weights_hash
+
+    one = hash_of(checkpoint)
+    with monkeypatch.context() as patch:
+        patch.setattr("transformers.configuration_utils.__version__", "99.0.0")
+        assert hash_of(checkpoint) == one
+    folder = shutil.copytree(checkpoint, tmp_path / "copy")
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps({**config, "shape_space": "mano"}))
+    assert hash_of(folder) != one
+
+
+def test_a_checkpoint_with_episodes_beside_it_is_a_checkpoint(checkpoint, truth, tmp_path):
+    folder = shutil.copytree(checkpoint, tmp_path / "trained")
+    save_all(truth[:1], folder / "validation")
+    assert Predictor.of(str(folder)).kind == "checkpoint"
+    (folder / "config.json").unlink()
+    assert Predictor.of(str(folder)).kind == "labels"
+
+
+def test_two_files_of_one_episode_are_refused(truth, tmp_path):
+    for run in ("one", "two"):
+        save_all(truth, tmp_path / "runs" / run)
+    with pytest.raises(ValueError, match=r"clip-0: \S+one/clip-0\.npz and \S+two/clip-0\.npz"):
+        Predictor.of(str(tmp_path / "runs")).open()
+
+
+def test_every_process_warms_up():
+    """The first clip that each process predicts is no steady state."""
+    results = [
+        ClipResult(f"c{i}", 10, "s", "", {}, seconds=s, peak_bytes=1, warm_up=s > 5)
+        for i, s in enumerate((9.0, 8.0, 1.0, 2.0))
+    ]
+    read = ClipResult("read", 10, "s", "", {})
+    found = efficiency_of([*results, read], {"device": "cpu"})
+    assert (found["frames"], found["seconds"]) == (20, 3.0)
+    assert efficiency_of([*results[:2], read], {}) is None
 
 
 def test_a_checkpoint_needs_pictures(checkpoint, labels, tmp_path):

@@ -2,8 +2,9 @@
 
 Results are what ``mint-hub evaluate`` wrote (``results/*.json``, schema 1), kept without ``clips``
 by ``python -m mint_hub.cards --keep``. Those of the same clips share a table, the rows that need no
-model once at its end. Checkpoints also give entries of the ``model-index`` in the head; without any
-the card says so.
+model once at its end. The checkpoint also gives the entries of the ``model-index`` in the head;
+without one the card says so. A card is of one model: huggingface_hub puts all entries of an index
+under one name, so that another's numbers would become this one's.
 """
 
 import json
@@ -76,7 +77,8 @@ def render(folder: Path) -> str:
 def keep_results(evaluation: Path, folder: Path) -> Path:
     """Copy an evaluation's results to where the card finds them: tables, and numbers without clips.
 
-    The file's name is that of benchmark and prediction; an older one of that name is replaced.
+    The file's name is that of benchmark (config, split, protocol and length of cut clips, too) and
+    prediction; an older one of that name is replaced.
 
     Args:
         evaluation: folder that ``mint-hub evaluate`` wrote.
@@ -92,7 +94,11 @@ def keep_results(evaluation: Path, folder: Path) -> Path:
         raise CardError(f"{tables}: expected this file beside results.json, got none")
     values.pop("clips", None)
     who = values["prediction"]["name"] if values["prediction"] else "trivial"
-    name = re.sub(r"[^a-z0-9.]+", "-", f"{values['benchmark']['name']}-{who}".lower()).strip("-.")
+    facts = values["benchmark"]
+    parts = [facts["name"], *(facts.get(part) for part in ("config", "split", "protocol"))]
+    parts.append(f"{facts['clip_frames']} frames" if facts.get("clip_frames") else None)
+    words = "-".join(str(part) for part in (*parts, who) if part)
+    name = re.sub(r"[^a-z0-9.]+", "-", words.lower()).strip("-.")
     kept = folder / RESULTS / f"{name}.json"
     with replacing(kept.with_suffix(".md")) as temporary:
         temporary.write_text(tables.read_text(encoding="utf-8"), encoding="utf-8")
@@ -136,10 +142,21 @@ def read_results(path: Path) -> dict[str, Any]:
 
 
 def card_head(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the metadata of the card, with a model-index where there are results."""
+    """Return the metadata of the card, with a model-index where there are results.
+
+    Raises:
+        CardError: results of checkpoints of several names, or of several weights under one.
+
+    """
     from huggingface_hub import ModelCardData
 
     models = [result for result in results if _kind(result) == "checkpoint"]
+    who = {f"{r['prediction']['name']} ({r['prediction'].get('weights')})": r for r in models}
+    if len(who) > 1:
+        raise CardError(
+            f"{RESULTS}: expected evaluations of one checkpoint, for a card is of one model, got "
+            f"{len(who)}: {', '.join(sorted(who))}; keep one of them here"
+        )
     evaluated = [entry for result in models for entry in _eval_results(result)]
     data = ModelCardData(
         language="en",
@@ -200,7 +217,7 @@ def _section(results: Sequence[Mapping[str, Any]]) -> str:
     about.append(
         f"{benchmark['clips']} clips, {benchmark['frames']} frames, hash {benchmark['hash']}; "
         f"mint-hub {last['mint_hub']}, {last['date'][:10]}. In brackets: 95 % of a bootstrap over "
-        f"clips. Mean hand: of {last['trained_on']}."
+        f"recordings. Mean hand: of {last['trained_on']}."
     )
     table = markdown_table(("", *(name for name, _ in columns)), rows)
     return f"### {benchmark['title']}\n\n{' '.join(about)}\n\n{table}"

@@ -50,6 +50,7 @@ Float = NDArray[np.float64]
 SIZE_HW: Final = (480, 672)
 CALIBRATED_HW: Final = (2000, 2800)
 EGO_VIEW: Final = "0"
+MISC: Final = "meta/misc.json"
 GET: Final = "register and download at https://arctic.is.tue.mpg.de"
 HAND_FIELDS: Final = {"rot": 3, "pose": 45, "trans": 3}
 
@@ -67,7 +68,7 @@ class ArcticBenchmark(Benchmark):
         if split not in lists:
             raise BenchmarkError(f"{path}: --split: expected one of {sorted(lists)}, got {split!r}")
         self._sequences: list[str] = sorted(lists[split])
-        self._offsets = _read_json(self._root / "meta" / "misc.json")
+        self._offsets = _read_json(self._root / MISC)
         self.notes = ("pictures undistorted to 672 x 480, K of each sequence",)
         if source.mano_dir is None:
             self.notes += ("cameras only: hands need your MANO files (--mano)",)
@@ -85,28 +86,13 @@ class ArcticBenchmark(Benchmark):
     def clip(self, i: int) -> Clip:
         """Read sequence ``i``."""
         name = self._sequences[i]
-        subject, sequence = name.split("/")
         camera = ego_camera(self._file(name, "egocam.dist.npy"))
         episode = self._episode(name, camera)
-        offset = self._offsets.get(subject, {}).get("ioi_offset")
-        folder = self._root / "cropped_images" / subject / sequence / EGO_VIEW
-        frames, why = None, f"{folder}: expected the egocentric pictures, found none; {GET}"
-        if folder.is_dir() and isinstance(offset, int):
-            paths = [folder / f"{k + offset:05d}.jpg" for k in range(episode.num_frames)]
-            there = [k for k, path in enumerate(paths) if path.is_file()]
-            if len(there) < episode.num_frames - 2 * max(offset, 1) or not there:
-                raise MissingFilesError(
-                    f"{folder}: expected about {episode.num_frames} pictures, got {len(there)}; "
-                    f"is the download whole? {GET}"
-                )
-            first, last = there[0], there[-1]
-            if last - first + 1 != len(there):
-                lost = next(p for p in paths[first:last] if not p.is_file())
-                raise MissingFilesError(
-                    f"{lost}: no such picture, others around it are there; {GET}"
-                )
-            episode = episode.window(first, len(there))
-            frames = _ArcticFrames(tuple(paths[first : last + 1]), camera)
+        first, paths, why = self._pictures(name, episode.num_frames)
+        frames = None
+        if paths:
+            episode = episode.window(first, len(paths))
+            frames = _ArcticFrames(paths, camera)
         return Clip(
             key=episode.key,
             truth=episode,
@@ -116,8 +102,39 @@ class ArcticBenchmark(Benchmark):
             hand_model=_hand_model(self.source.mano_dir),
             source="arctic",
             hands=self.source.mano_dir is not None,
-            without_frames="" if frames else why,
+            without_frames=why,
         )
+
+    def num_frames(self, i: int) -> int:
+        """Return the length of sequence ``i``, from its cameras and the names of its pictures."""
+        name = self._sequences[i]
+        count = len(ego_camera(self._file(name, "egocam.dist.npy")).T_camera_from_world)
+        return len(self._pictures(name, count)[1]) or count
+
+    def _pictures(self, name: str, count: int) -> tuple[int, tuple[Path, ...], str]:
+        """Find the pictures of ``count`` frames: the first that has one, the files, why none."""
+        subject, sequence = name.split("/")
+        folder = self._root / "cropped_images" / subject / sequence / EGO_VIEW
+        if not folder.is_dir():
+            return 0, (), f"{folder}: expected the egocentric pictures, found none; {GET}"
+        about: Any = self._offsets.get(subject)
+        offset = about.get("ioi_offset") if isinstance(about, dict) else None
+        if not isinstance(offset, int):
+            path = self._root / MISC
+            lost = f"{path}: expected ioi_offset of {subject}, which pairs pictures and truth"
+            return 0, (), f"{lost}, found none; {GET}"
+        paths = [folder / f"{k + offset:05d}.jpg" for k in range(count)]
+        there = [k for k, path in enumerate(paths) if path.is_file()]
+        if len(there) < count - 2 * max(offset, 1) or not there:
+            raise MissingFilesError(
+                f"{folder}: expected about {count} pictures, got {len(there)}; "
+                f"is the download whole? {GET}"
+            )
+        first, last = there[0], there[-1]
+        if last - first + 1 != len(there):
+            lost = next(p for p in paths[first:last] if not p.is_file())
+            raise MissingFilesError(f"{lost}: no such picture, others around it are there; {GET}")
+        return first, tuple(paths[first : last + 1]), ""
 
     def _file(self, name: str, suffix: str) -> Path:
         return self._root / "raw_seqs" / f"{name}.{suffix}"
@@ -125,11 +142,12 @@ class ArcticBenchmark(Benchmark):
     def _episode(self, name: str, camera: "EgoCamera") -> Episode:
         count = len(camera.T_camera_from_world)
         state, presence = np.asarray(hands.absent((count, 2)), float), np.zeros((count, 2), bool)
-        quality: dict[str, Any] = {"quality": {"hands": HANDS_UNAVAILABLE}}
+        about: dict[str, Any] = {"quality": {"hands": HANDS_UNAVAILABLE}}
         if self.source.mano_dir is not None:
             path = self._file(name, "mano.npy")
             state = hand_states(path, camera.T_camera_from_world, self.source.mano_dir)
-            presence, quality = np.ones((count, 2), bool), {}
+            presence = np.ones((count, 2), bool)
+            about = {"hand_model": _hand_model(self.source.mano_dir).name}
         fov = np.asarray(K_to_fov_vh(camera.K, SIZE_HW), np.float32)
         return Episode(
             key=f"arctic-{name.replace('/', '-')}".lower(),
@@ -146,7 +164,7 @@ class ArcticBenchmark(Benchmark):
                 "fps": MODEL_FPS,
                 "shape_space": "mano",
                 "scale_status": "metric, motion capture",
-                **quality,
+                **about,
             },
         )
 
@@ -236,10 +254,10 @@ class _ArcticFrames(Frames):
     paths: tuple[Path, ...]
     camera: EgoCamera
 
-    def images(self) -> Iterator[Image]:
+    def images(self, start: int = 0) -> Iterator[Image]:
         """Yield the rectified pictures."""
         warp: Rectification | None = None
-        for path in self.paths:
+        for path in self.paths[start:]:
             image = decoded_picture(path.read_bytes(), str(path), GET)
             size = (image.shape[0], image.shape[1])
             if warp is None or warp.source_size_hw != size:

@@ -84,6 +84,13 @@ class Hot3DBenchmark(Benchmark):
         read = _read_sequence if item.is_dir() else _read_clip
         return read(item, self.source)
 
+    def num_frames(self, i: int) -> int:
+        """Return the length of clip ``i``; of a sequence, its cameras tell."""
+        item = self._items[i]
+        if not item.is_dir():
+            return CLIP_FRAMES
+        return _read_sequence(item, replace(self.source, mano_dir=None)).truth.num_frames
+
 
 @dataclass(frozen=True, eq=False)
 class Upright:
@@ -123,15 +130,18 @@ def in_protocol(episode: Episode) -> Episode:
 
 
 def _clip(episode: Episode, frames: Frames | None, source: Source, why: str) -> Clip:
+    model, known = truth_model(episode, source.mano_dir), knows_hands(episode)
+    if known:
+        episode = replace(episode, meta={**episode.meta, "hand_model": model.name})
     return Clip(
         key=episode.key,
         truth=episode,
         K=PROTOCOL_K,
         image_size_hw=SIZE_HW,
         frames=frames,
-        hand_model=truth_model(episode, source.mano_dir),
+        hand_model=model,
         source="hot3d",
-        hands=knows_hands(episode),
+        hands=known,
         without_frames="" if frames else why,
     )
 
@@ -188,9 +198,9 @@ class _StampedFrames(Frames):
             paths.append(there[int(near[0])])
         return cls(tuple(paths), upright)
 
-    def images(self) -> Iterator[Image]:
+    def images(self, start: int = 0) -> Iterator[Image]:
         """Yield the upright pictures."""
-        for path in self.paths:
+        for path in self.paths[start:]:
             yield self.upright.apply(decoded_picture(path.read_bytes(), str(path), GET))
 
     def stamp(self) -> str:
@@ -317,10 +327,10 @@ class _TarFrames(Frames):
     names: tuple[str, ...]
     upright: Upright
 
-    def images(self) -> Iterator[Image]:
+    def images(self, start: int = 0) -> Iterator[Image]:
         """Yield the upright pictures."""
         with _opened(self.path) as tar:
-            for name in self.names:
+            for name in self.names[start:]:
                 yield self.upright.apply(
                     decoded_picture(_member(tar, name, self.path), f"{self.path}: {name}", GET)
                 )

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -25,8 +26,8 @@ class ShardsBenchmark(Benchmark):
     """The episodes of one split as clips; pictures are those packed beside the labels."""
 
     def __init__(self, source: Source, title: str | None = None) -> None:
-        self.source = source
         config, split = _choice(Path(source.root), source.config, source.split)
+        self.source = replace(source, config=config, split=split)  # results say which
         self._reader = CorpusReader(source.root, config, split)
         self._packed = VIDEO_MEMBER in self._reader.manifest.members
         self.title = title or f"{config}/{split}"
@@ -35,6 +36,10 @@ class ShardsBenchmark(Benchmark):
 
     def __len__(self) -> int:
         return len(self._reader)
+
+    def num_frames(self, i: int) -> int:
+        """Return the length of clip ``i``, from the index."""
+        return int(self._reader.num_frames[i])
 
     def clip(self, i: int) -> Clip:
         """Read clip ``i``."""
@@ -51,15 +56,23 @@ class LabelsBenchmark(Benchmark):
     def __init__(self, source: Source) -> None:
         self.source = source
         self.title = f"labels in {Path(source.root).name}"
-        self._files = label_files(Path(source.root))
+        self._files = sorted(label_files(Path(source.root)).items())
 
     def __len__(self) -> int:
         return len(self._files)
 
+    def num_frames(self, i: int) -> int:
+        """Return the length of clip ``i``, from its presence alone."""
+        path = self._files[i][1]
+        try:
+            with np.load(path) as file:
+                return len(file["presence"])
+        except (OSError, KeyError, TypeError, ValueError, BadZipFile):
+            return super().num_frames(i)  # says what is wrong with it
+
     def clip(self, i: int) -> Clip:
         """Read clip ``i``."""
-        key = sorted(self._files)[i]
-        episode = Episode.load(self._files[key])
+        episode = Episode.load(self._files[i][1])
         return clip_of(episode, None, self.source.mano_dir, "labels come without video")
 
 
@@ -96,17 +109,12 @@ def synthetic_benchmark(source: Source, num_procs: int = 1) -> ShardsBenchmark:
 def clip_of(
     episode: Episode, frames: PackedFrames | None, mano_dir: str | None, why: str = ""
 ) -> Clip:
-    """Make the clip of an episode; its camera is that of the first frame, as clips do not zoom."""
-    spread = float(np.ptp(episode.fov_vh_rad, axis=0).max())
-    if spread > 0.02:
-        raise BenchmarkError(
-            f"{episode.key}: expected one field of view for all frames of a true clip, got a "
-            f"spread of {np.degrees(spread):.1f} degrees"
-        )
+    """Make the clip of an episode, scored in its own camera: one K, or a K a frame if it zooms."""
+    zooms = bool(np.ptp(episode.fov_vh_rad, axis=0).any())
     return Clip(
         key=episode.key,
         truth=episode,
-        K=episode.K.mean(axis=0),
+        K=episode.K if zooms else episode.K[0],
         image_size_hw=episode.image_size_hw,
         frames=frames,
         hand_model=truth_model(episode, mano_dir),
@@ -122,6 +130,7 @@ def label_files(folder: Path) -> dict[str, Path]:
 
     Raises:
         MissingFilesError: there is no such folder, or no episode in it.
+        BenchmarkError: two files of one key; names both.
 
     """
     if not folder.is_dir():
@@ -132,7 +141,13 @@ def label_files(folder: Path) -> dict[str, Path]:
     for path in sorted(folder.rglob("*.npz")):
         if any(part.startswith(".") for part in path.relative_to(folder).parts):
             continue
-        found[path.parent.name if path.stem == "episode" else path.stem] = path
+        key = path.parent.name if path.stem == "episode" else path.stem
+        if key in found:
+            raise BenchmarkError(
+                f"{folder}: expected one file of each episode, got two of {key}: {found[key]} and "
+                f"{path}"
+            )
+        found[key] = path
     if not found:
         raise MissingFilesError(f"{folder}: expected episodes (KEY.npz, KEY/episode.npz), got none")
     return found

@@ -7,9 +7,11 @@ words which benchmark it is, so that every process opens its own.
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
+from itertools import islice
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import cv2
 import numpy as np
@@ -73,8 +75,11 @@ class Frames(ABC):
     """Pictures of a clip, one for each frame of its truth."""
 
     @abstractmethod
-    def images(self) -> Iterator[Image]:
-        """Yield (H, W, 3) uint8 RGB, as the protocol's camera sees them, in order."""
+    def images(self, start: int = 0) -> Iterator[Image]:
+        """Yield (H, W, 3) uint8 RGB, as the protocol's camera sees them, in order, from ``start``.
+
+        Those before it are not decoded.
+        """
 
     @abstractmethod
     def stamp(self) -> str:
@@ -87,11 +92,11 @@ class PackedFrames(Frames):
 
     mp4: bytes
 
-    def images(self) -> Iterator[Image]:
+    def images(self, start: int = 0) -> Iterator[Image]:
         """Yield the decoded frames."""
         with PackedClip(self.mp4) as clip:
-            for start in range(0, clip.num_frames, 32):
-                yield from clip.images(start, min(32, clip.num_frames - start))
+            for at in range(start, clip.num_frames, 32):
+                yield from clip.images(at, min(32, clip.num_frames - at))
 
     def stamp(self) -> str:
         """Return the hash of the bytes."""
@@ -106,13 +111,9 @@ class FrameWindow(Frames):
     start: int
     length: int
 
-    def images(self) -> Iterator[Image]:
-        """Yield frames start .. start + length - 1."""
-        for k, image in enumerate(self.whole.images()):
-            if k >= self.start + self.length:
-                return
-            if k >= self.start:
-                yield image
+    def images(self, start: int = 0) -> Iterator[Image]:
+        """Yield frames start .. length - 1 of the window."""
+        yield from islice(self.whole.images(self.start + start), self.length - start)
 
     def stamp(self) -> str:
         """Return the whole's, and which part."""
@@ -126,7 +127,7 @@ class Clip:
     Attributes:
         key: its name within the benchmark.
         truth: what is true, T frames.
-        K: (3, 3) pixels, the camera of the protocol.
+        K: (3, 3) pixels, the camera of the protocol; (T, 3, 3) where it zooms.
         image_size_hw: of the protocol's image, in which a hand is on screen or not.
         frames: the pictures; None where the user has none.
         hand_model: turns the truth's states into joints.
@@ -135,6 +136,7 @@ class Clip:
         hands: whether the truth knows the hands.
         without_frames: why there are no pictures, and where to get them.
         part_of: key of the clip that this is a window of.
+        whole_frames: how many frames that clip has; None where this is no window.
 
     """
 
@@ -149,6 +151,7 @@ class Clip:
     hands: bool = True
     without_frames: str = ""
     part_of: str | None = None
+    whole_frames: int | None = None
 
     @property
     def whole(self) -> tuple[str, int]:
@@ -164,22 +167,52 @@ class Clip:
             self,
             key=key,
             part_of=self.key,
+            whole_frames=self.truth.num_frames,
             truth=replace(self.truth.window(start, length), key=key),
+            K=self.K if self.K.ndim == 2 else self.K[part],
             frames=None if self.frames is None else FrameWindow(self.frames, start, length),
             visible=None if self.visible is None else self.visible[part],
         )
 
-    def stamp(self) -> str:
-        """Return 16 hex digits that change when truth, its hand, camera or pictures do."""
-        digest = hashlib.sha256(f"{self.key} {self.image_size_hw}".encode())
-        for name, value in self.truth.to_dict().items():
-            if isinstance(value, np.ndarray):
-                digest.update(f" {name} ".encode() + value.tobytes())
-        for asset in (self.hand_model.left, self.hand_model.right):
-            digest.update(np.ascontiguousarray(asset.template).tobytes())
-        digest.update(np.ascontiguousarray(self.K, np.float64).tobytes())
-        digest.update(("" if self.frames is None else self.frames.stamp()).encode())
+    def truth_stamp(self) -> str:
+        """Return 16 hex digits that change when the truth, its hand or its camera does.
+
+        Pictures do not count: two scores are of the same truth wherever the pictures lie, or where
+        one side had none. Numbers are rounded (poses and states to 1e-5, K to a thousandth of a
+        pixel), for their last bits differ from machine to machine.
+        """
+        digest = hashlib.sha256(f"{self.key} {self.image_size_hw} {self.hands}".encode())
+        arrays = {k: v for k, v in self.truth.to_dict().items() if isinstance(v, np.ndarray)}
+        if self.visible is not None:
+            arrays["visible"] = self.visible
+        for name, values in arrays.items():
+            digest.update(f" {name} ".encode() + _rounded(values, 5))
+        digest.update(_rounded(self.K, 3) + _hand_stamp(self.hand_model).encode())
         return digest.hexdigest()[:16]
+
+    def stamp(self) -> str:
+        """Return 16 hex digits that change when truth or pictures do: what a prediction is of."""
+        pictures = "" if self.frames is None else self.frames.stamp()
+        return hashlib.sha256(f"{self.truth_stamp()} {pictures}".encode()).hexdigest()[:16]
+
+
+def _rounded(values: NDArray[Any], digits: int) -> bytes:
+    """The bytes of an array, numbers to so many digits, minus zero as zero."""
+    if values.dtype.kind == "f":
+        values = np.round(values.astype(np.float64), digits) + 0.0
+    return f"{values.shape}".encode() + np.ascontiguousarray(values).tobytes()
+
+
+@lru_cache(maxsize=4)
+def _hand_stamp(model: HandModel) -> str:
+    """Words that change when any array of a pair of hands does, or what their shapes mean."""
+    digest = hashlib.sha256(model.shape_space.encode())
+    for asset in (model.left, model.right):
+        for array in fields(asset):
+            values = getattr(asset, array.name)
+            if isinstance(values, np.ndarray):
+                digest.update(f" {array.name} ".encode() + _rounded(values, 8))
+    return digest.hexdigest()
 
 
 class Benchmark(ABC):
@@ -210,17 +243,25 @@ class Benchmark(ABC):
 
         """
 
+    def num_frames(self, i: int) -> int:
+        """Return the length of clip ``i``; reads no more than that where its files allow."""
+        return self.clip(i).truth.num_frames
+
     def __iter__(self) -> Iterator[Clip]:
         return (self.clip(i) for i in range(len(self)))
 
 
 @dataclass(eq=False)
 class Chosen(Benchmark):
-    """Parts of the clips of another benchmark: cut to a length, thinned out."""
+    """Parts of the clips of another benchmark: cut to a length, thinned out.
+
+    The last whole clip is kept, for the next part is mostly of the same.
+    """
 
     whole: Benchmark
     parts: Sequence[tuple[int, int, int]]
     source: Source = field(init=False)
+    _last: tuple[int, Clip] | None = field(init=False, default=None, repr=False)
 
     def __post_init__(self) -> None:
         self.source, self.title = self.whole.source, self.whole.title
@@ -232,8 +273,15 @@ class Chosen(Benchmark):
     def clip(self, i: int) -> Clip:
         """Read clip ``i``; errors as of the whole benchmark."""
         number, start, length = self.parts[i]
-        clip = self.whole.clip(number)
+        if self._last is None or self._last[0] != number:
+            self._last = (number, self.whole.clip(number))
+        clip = self._last[1]
         return clip if length == 0 else clip.window(start, length)
+
+    def num_frames(self, i: int) -> int:
+        """Return the length of clip ``i``."""
+        number, _, length = self.parts[i]
+        return length or self.whole.num_frames(number)
 
 
 def chosen(benchmark: Benchmark) -> Benchmark:
@@ -247,7 +295,7 @@ def chosen(benchmark: Benchmark) -> Benchmark:
         return Chosen(benchmark, [(i, 0, 0) for i in numbers]) if source.limit else benchmark
     size, parts = source.clip_frames, list[tuple[int, int, int]]()
     for i in numbers:
-        frames = benchmark.clip(i).truth.num_frames
+        frames = benchmark.num_frames(i)
         parts += [(i, at, min(size, frames - at)) for at in range(0, frames, size)]
     return Chosen(benchmark, parts)
 

@@ -18,7 +18,7 @@ from mint_hub.evaluation.clips import (
     MissingFilesError,
     Source,
 )
-from mint_hub.evaluation.predictor import OpenPredictor, Predictor
+from mint_hub.evaluation.predictor import OpenPredictor, Prediction, Predictor
 from mint_hub.evaluation.results import ClipResult, Results, efficiency_of
 from mint_hub.evaluation.scoring import ClipScorer, Score
 from mint_hub.evaluation.trivial import MeanHand, trivial_predictions
@@ -57,7 +57,7 @@ class _Scorer:
 
     def _scores(self, clip: Clip, predictor: OpenPredictor | None) -> "ClipResult | str":
         scores: dict[str, Score] = {}
-        seconds = peak = None
+        made: Prediction | None = None
         scorer = ClipScorer(clip, predictor.hand_model if predictor else None)
         if predictor is not None:
             try:
@@ -66,12 +66,20 @@ class _Scorer:
                 if self.on_missing == "skip":
                     return clip.key
                 raise
-            seconds, peak = made.seconds, made.peak_bytes
             scores["prediction"] = scorer.score(made.episode)
         for row, episode in trivial_predictions(clip.truth, self.mean, scorer.seen()).items():
             scores[row] = scorer.score(episode, row)
-        frames = clip.truth.num_frames
-        return ClipResult(clip.key, frames, clip.source, clip.stamp(), scores, seconds, peak)
+        return ClipResult(
+            key=clip.key,
+            frames=clip.truth.num_frames,
+            source=clip.source,
+            stamp=clip.truth_stamp(),
+            scores=scores,
+            seconds=made.seconds if made else None,
+            peak_bytes=made.peak_bytes if made else None,
+            part_of=clip.part_of,
+            warm_up=made.warm_up if made else False,
+        )
 
 
 def evaluate(

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from mint_hub.evaluation.clips import Clip
 from mint_hub.evaluation.results import Results
-from mint_hub.evaluation.scoring import model_for
+from mint_hub.evaluation.scoring import ClipScorer, model_for
 from mint_hub.geometry import rigid
 from mint_hub.geometry.hand_model import HandModel
+from mint_hub.geometry.hand_state import unpack
 from mint_hub.geometry.metrics import align_paths
 from mint_hub.loaders.schema import Episode
 from mint_hub.view import canvas
@@ -140,12 +141,16 @@ def path_figure(clip: Clip, predicted: Episode, size: int = 360) -> Image:
 
 
 def worst_frame(clip: Clip, predicted: Episode) -> int:
-    """Number of the frame whose hands are furthest off; one missed or made up counts MISS_M."""
-    truth = clip.truth
-    there, guess = truth.presence, predicted.presence
-    place, other = (e.hand_state[..., :3].astype(float) for e in (truth, predicted))
-    joints = np.linalg.norm(place - other, axis=-1)
-    error = np.where(there & guess, joints, np.where(there ^ guess, MISS_M, 0.0))
+    """Number of the frame whose hands are furthest off; one missed or made up counts MISS_M.
+
+    As scored: a true hand off screen is neither missed nor, where predicted, made up.
+    """
+    truth, guess = clip.truth, predicted.presence
+    seen = ClipScorer(clip).seen()
+    place, other = (unpack(e.hand_state.astype(float)).translation for e in (truth, predicted))
+    far = np.linalg.norm(place - other, axis=-1)
+    wrong = (seen & ~guess) | (~truth.presence & guess)
+    error = np.where(seen & guess, far, np.where(wrong, MISS_M, 0.0))
     return int(error.sum(axis=1).argmax())
 
 

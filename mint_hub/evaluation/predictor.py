@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -25,17 +25,24 @@ from mint_hub.loaders.atomic import replacing
 from mint_hub.loaders.reader import CorpusReader
 from mint_hub.loaders.schema import Episode
 
+NOT_THE_MODEL: Final = ("_name_or_path", "transformers_version")
+"""Entries of a configuration that say where it came from and who wrote it."""
+
 if TYPE_CHECKING:
     from mint_hub.inference.runner import MintRunner, RunSettings
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """A clip's prediction, and what making it took; no seconds where it was not made now."""
+    """A clip's prediction, and what making it took; no seconds where it was not made now.
+
+    ``warm_up`` says that it was the first that its process made.
+    """
 
     episode: Episode
     seconds: float | None = None
     peak_bytes: int | None = None
+    warm_up: bool = False
 
 
 @dataclass(frozen=True)
@@ -67,7 +74,7 @@ class Predictor:
 
     @classmethod
     def of(cls, what: str, name: str | None = None, **options: Any) -> "Predictor":
-        """Look at what lies there: labels are told by their files.
+        """Look at what lies there: a checkpoint has config.json, labels are told by their files.
 
         Raises:
             MissingFilesError: a local path with nothing at it.
@@ -78,8 +85,11 @@ class Predictor:
             raise MissingFilesError(
                 f"{what}: expected a folder with a checkpoint or labels, found none"
             )
-        labels = folder.is_dir() and (is_corpus(folder) or any(folder.rglob("*.npz")))
-        if folder.is_dir() and not labels and not (folder / "config.json").is_file():
+        configured = (folder / "config.json").is_file()
+        labels = (
+            not configured and folder.is_dir() and (is_corpus(folder) or any(folder.rglob("*.npz")))
+        )
+        if folder.is_dir() and not labels and not configured:
             raise MissingFilesError(
                 f"{what}: expected a checkpoint (config.json), saved episodes (.npz) or a corpus, "
                 "found neither"
@@ -118,6 +128,7 @@ class OpenLabels(OpenPredictor):
     def __init__(self, spec: Predictor) -> None:
         folder = Path(spec.what).expanduser()
         self._spec, self._where = spec, dict[str, Any]()
+        self._last: tuple[str, Episode] | None = None
         if is_corpus(folder):
             for path in sorted(folder.glob("*/*/shards.json")):
                 reader = CorpusReader(folder, path.parent.parent.name, path.parent.name)
@@ -133,7 +144,13 @@ class OpenLabels(OpenPredictor):
         return {"name": self._spec.name, "kind": "labels", "episodes": len(self._where)}
 
     def predict(self, clip: Clip) -> Prediction:
-        """Read the labels of a clip; those of a whole clip serve its windows."""
+        """Read the labels of a clip; those of a whole clip serve its windows.
+
+        Raises:
+            MissingFilesError: there are none.
+            BenchmarkError: those of the whole clip have another number of frames than it.
+
+        """
         place, key = self._where.get(clip.key), clip.key
         start = 0
         if place is None:
@@ -144,17 +161,25 @@ class OpenLabels(OpenPredictor):
                 f"{self._spec.what}: expected labels of {clip.key}, found none (of "
                 f"{len(self._where)} episodes, the first is {min(self._where)})"
             )
-        episode = Episode.load(place) if isinstance(place, Path) else place[0][place[1]]
-        if key != clip.key:
-            episode = episode.window(start, clip.truth.num_frames)
-        return Prediction(episode)
+        if self._last is None or self._last[0] != key:  # windows of a clip come one by one
+            episode = Episode.load(place) if isinstance(place, Path) else place[0][place[1]]
+            self._last = (key, episode)
+        episode = self._last[1]
+        if key == clip.key:
+            return Prediction(episode)
+        if episode.num_frames != clip.whole_frames:
+            raise BenchmarkError(
+                f"{self._spec.what}: {key}: expected labels of {clip.whole_frames} frames, as the "
+                f"truth has, got {episode.num_frames}"
+            )
+        return Prediction(episode.window(start, clip.truth.num_frames))
 
 
 class OpenCheckpoint(OpenPredictor):
     """A model that is run on pictures, and the cache of what it said."""
 
     def __init__(self, spec: Predictor) -> None:
-        self._spec = spec
+        self._spec, self._warm = spec, False
         if spec.mano_dir is not None:
             self.hand_model = HandModel.default(spec.mano_dir)
 
@@ -175,11 +200,11 @@ class OpenCheckpoint(OpenPredictor):
 
     @cached_property
     def weights_hash(self) -> str:
-        """16 hex digits of all weights and the configuration."""
+        """16 hex digits of all weights and the configuration, whatever libraries wrote them."""
         import torch
 
         model = self._runner.models[0]
-        config = {k: v for k, v in model.config.to_dict().items() if k != "_name_or_path"}
+        config = {k: v for k, v in model.config.to_dict().items() if k not in NOT_THE_MODEL}
         digest = hashlib.blake2b(json.dumps(config, sort_keys=True, default=str).encode())
         for name, weight in sorted(model.state_dict().items()):
             plain = weight.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy()
@@ -227,7 +252,8 @@ class OpenCheckpoint(OpenPredictor):
         if path is not None:
             with replacing(path) as temporary:
                 made.save(temporary)
-        return Prediction(made, seconds, _peak_bytes(self._runner.models[0].device.type))
+        first, self._warm = not self._warm, True
+        return Prediction(made, seconds, _peak_bytes(self._runner.models[0].device.type), first)
 
     def _settings(self, fps: float) -> "RunSettings":
         from mint_hub.inference.runner import RunSettings

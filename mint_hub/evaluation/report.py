@@ -4,7 +4,6 @@ import base64
 import html
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from math import isnan
 from pathlib import Path
 from typing import Final
@@ -187,7 +186,7 @@ def _worst(
         frame = worst_frame(clip, predicted)
         picture = None
         if clip.frames is not None:
-            picture = next(islice(clip.frames.images(), frame, None), None)
+            picture = next(clip.frames.images(frame), None)
         model = None if opened is None else opened.hand_model
         pair = pair_figure(clip, predicted, frame, picture, model)
         yield _Worst(result, clip, frame, pair, path_figure(clip, predicted))

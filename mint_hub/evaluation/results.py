@@ -6,11 +6,13 @@ The file (schema 1) holds
   null), hash of all clips' truth;
 - ``prediction``: facts of the checkpoint or labels, or null where only trivial rows were asked for;
 - ``rows``: for the prediction and each trivial row its numbers, each as [value, low, high] with the
-  95 % interval of a bootstrap over clips (nulls where nothing was counted, or of one clip):
+  95 % interval of a bootstrap over recordings (nulls where fewer than two have the number; a clip
+  that is no window of another is a recording):
   ``hands`` by reading of the camera (see `scoring`), ``camera`` as mean and median over clips,
   ``world`` by alignment, ``strata`` (value alone, and ``hands`` counted), ``fov_error_deg``;
-- ``clips``: key, frames, source, seconds and the statistics of every row, which add: from them
-  everything above can be made again, and two files can be compared clip by clip;
+- ``clips``: key, part_of (the recording that it is a window of, or null), frames, source, stamp of
+  the truth, seconds and the statistics of every row, which add: from them everything above can be
+  made again, and two files can be compared clip by clip;
 - ``efficiency``, ``warnings``, ``skipped`` (clips without a prediction), ``mint_hub``, ``date``.
 """
 
@@ -21,26 +23,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
+from mint_hub.evaluation.bootstrap import RESAMPLES, SEED, Resamples
 from mint_hub.evaluation.scoring import Score
-from mint_hub.geometry.metrics import (
-    TRAJECTORY_MEASURES,
-    HandStatistics,
-    TrajectoryStatistics,
-    WorldStatistics,
-    none_for_nan,
-)
+from mint_hub.evaluation.summary import summarise
+from mint_hub.geometry.metrics import none_for_nan
 from mint_hub.loaders.atomic import replacing
 
 SCHEMA: Final = 1
 KIND: Final = "mint-hub evaluation"
-RESAMPLES: Final = 1000
-SEED: Final = 0
-
-Triple = tuple[float, float, float]
-"""A value and its 95 % interval."""
 
 
 class ResultsError(ValueError):
@@ -49,7 +39,20 @@ class ResultsError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class ClipResult:
-    """The scores of one clip by row; ``seconds`` and ``peak_bytes`` where it was predicted now."""
+    """The scores of one clip by row.
+
+    Attributes:
+        key: the clip's.
+        frames: how many.
+        source: data set that it comes from.
+        stamp: of the truth and its hand, see `Clip.truth_stamp`.
+        scores: by row.
+        seconds: what the prediction took, where it was made now.
+        peak_bytes: memory then.
+        part_of: key of the recording that it is a window of.
+        warm_up: whether it was the first that its process predicted.
+
+    """
 
     key: str
     frames: int
@@ -58,6 +61,13 @@ class ClipResult:
     scores: dict[str, Score]
     seconds: float | None = None
     peak_bytes: int | None = None
+    part_of: str | None = None
+    warm_up: bool = False
+
+    @property
+    def recording(self) -> str:
+        """What it is drawn together with by the bootstrap."""
+        return self.part_of or self.key
 
     def to_dict(self) -> dict[str, Any]:
         """Return what JSON holds of it."""
@@ -65,7 +75,9 @@ class ClipResult:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "ClipResult":
-        """Invert ``to_dict``."""
+        """Invert ``to_dict``; ValueError where the scores are no mapping."""
+        if not isinstance(values["scores"], Mapping):
+            raise ValueError(f"scores: expected them by row, got {values['scores']!r}")
         scores = {k: Score.from_dict(v) for k, v in values["scores"].items()}
         plain: dict[str, Any] = {k: v for k, v in values.items() if k != "scores"}
         return cls(**plain, scores=scores)
@@ -110,7 +122,10 @@ class Results:
     @cached_property
     def summary(self) -> dict[str, dict[str, Any]]:
         """Numbers of every row, see the module."""
-        return {row: summarise([clip.scores[row] for clip in self.clips]) for row in self.rows}
+        draws = Resamples.of([clip.recording for clip in self.clips])
+        return {
+            row: summarise([clip.scores[row] for clip in self.clips], draws) for row in self.rows
+        }
 
     def to_dict(self) -> dict[str, Any]:
         """Return what the file holds."""
@@ -126,7 +141,12 @@ class Results:
             "benchmark": self.benchmark,
             "prediction": self.prediction,
             "trained_on": self.trained_on,
-            "intervals": {"resamples": RESAMPLES, "seed": SEED, "level": 0.95, "over": "clips"},
+            "intervals": {
+                "resamples": RESAMPLES,
+                "seed": SEED,
+                "level": 0.95,
+                "over": "recordings",
+            },
             "rows": rows,
             "efficiency": self.efficiency,
             "warnings": list(self.warnings),
@@ -165,8 +185,8 @@ class Results:
             raise ResultsError(f"{path}: expected JSON, got {error}") from None
         if not isinstance(values, dict) or values.get("kind") != KIND:
             raise ResultsError(f"{path}: expected results of `mint-hub evaluate`, got other JSON")
-        if values["schema"] != SCHEMA:
-            raise ResultsError(f"{path}: schema: expected {SCHEMA}, got {values['schema']}")
+        if values.get("schema") != SCHEMA:
+            raise ResultsError(f"{path}: schema: expected {SCHEMA}, got {values.get('schema')}")
         try:
             return cls(
                 values["benchmark"],
@@ -179,114 +199,20 @@ class Results:
                 values["mint_hub"],
                 values["date"],
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ResultsError(
                 f"{path}: expected schema {SCHEMA} whole, got {type(error).__name__}: {error}"
             ) from None
 
 
-# --------------------------------------------------------------------------- summing up
-
-
-def summarise(scores: Sequence[Score]) -> dict[str, Any]:
-    """Numbers of one row over its clips, each with its interval."""
-    draws = resamples(len(scores))
-    found: dict[str, Any] = {"hands": {}, "camera": {}, "world": {}, "strata": {}}
-    for name in {key: None for score in scores for key in score.hands}:
-        parts = [score.hands.get(name, HandStatistics()) for score in scores]
-        found["hands"][name] = pooled(parts, HandStatistics, draws)
-    for name in {key: None for score in scores for key in score.world}:
-        parts = [score.world.get(name, WorldStatistics()) for score in scores]
-        found["world"][name] = pooled(parts, WorldStatistics, draws)
-    if any(score.camera is not None for score in scores):
-        found["camera"] = camera_numbers(scores, draws)
-    for name in {key: None for score in scores for key in score.strata}:
-        parts = [score.strata.get(name, HandStatistics()) for score in scores]
-        total = totalled(parts, HandStatistics)
-        counted = {"hands": total.pose_count, "negatives": total.negatives}
-        found["strata"][name] = {**counted, **total.metrics()}
-    fov = np.array([score.fov_error_deg for score in scores])
-    found["fov_error_deg"] = _with_interval(fov, draws, np.nanmean)
-    return found
-
-
-def resamples(count: int) -> NDArray[np.int64]:
-    """Clips drawn with replacement, (RESAMPLES, count), the same for equal counts."""
-    rng = np.random.default_rng(SEED)
-    return rng.integers(0, max(count, 1), (RESAMPLES if count > 1 else 0, count))
-
-
-def pooled(parts: Sequence[Any], kind: Any, draws: NDArray[np.int64]) -> dict[str, Triple]:
-    """Metrics of the sum of statistics, and their intervals over resampled clips."""
-    value, drawn = totalled(parts, kind).metrics(), drawn_metrics(parts, kind, draws)
-    return {name: (value[name], *percentiles(np.array([d[name] for d in drawn]))) for name in value}
-
-
-def drawn_metrics(
-    parts: Sequence[Any], kind: Any, draws: NDArray[np.int64]
-) -> list[dict[str, float]]:
-    """Metrics of the sum of statistics, for each draw of clips (N, clips)."""
-    names = list(kind().to_dict())
-    table = np.array([[part.to_dict()[name] for name in names] for part in parts], float)
-    sums = table[draws].sum(axis=1) if len(draws) else np.zeros((0, len(names)))
-    return [kind(**dict(zip(names, row, strict=True))).metrics() for row in sums.tolist()]
-
-
-def totalled(parts: Sequence[Any], kind: Any) -> Any:
-    """The sum of statistics of a kind."""
-    total = kind()
-    for part in parts:
-        total = total + part
-    return total
-
-
-def camera_numbers(scores: Sequence[Score], draws: NDArray[np.int64]) -> dict[str, Any]:
-    """Mean and median over sequences, without degenerate ones unless there are no others."""
-    errors = [score.camera for score in scores]
-    known = [e for e in errors if e is not None]
-    lenient = all(e.degenerate for e in known)
-    found: dict[str, Any] = {
-        "sequences": len(known),
-        "degenerate": sum(e.degenerate for e in known),
-    }
-    value = TrajectoryStatistics(tuple(known)).metrics(with_degenerate=lenient)
-    rows = [e.values() if e is not None and (lenient or not e.degenerate) else None for e in errors]
-    for measure in TRAJECTORY_MEASURES:
-        column = np.array([np.nan if r is None else r[measure.name] for r in rows])
-        for word, function in (("mean", np.nanmean), ("median", np.nanmedian)):
-            interval = _with_interval(column, draws, function)[1:]
-            found[f"{measure.name} {word}"] = (value[f"{measure.name} {word}"], *interval)
-    return found
-
-
-def percentiles(values: NDArray[np.float64]) -> tuple[float, float]:
-    """The 95 % interval of what came out of resamples; NaN where most have no value."""
-    known = values[np.isfinite(values)]
-    if len(known) < max(1, len(values) // 2):
-        return float("nan"), float("nan")
-    low, high = np.percentile(known, [2.5, 97.5])
-    return float(low), float(high)
-
-
-def _with_interval(column: NDArray[np.float64], draws: NDArray[np.int64], function: Any) -> Triple:
-    if not np.isfinite(column).any():
-        return float("nan"), float("nan"), float("nan")
-    value = float(function(column))
-    if not len(draws):
-        return value, float("nan"), float("nan")
-    drawn = column[draws]
-    known = np.isfinite(drawn).any(axis=1)
-    return (value, *percentiles(np.asarray(function(drawn[known], axis=1))))
-
-
 def efficiency_of(
     clips: Sequence[ClipResult], prediction: Mapping[str, Any]
 ) -> dict[str, Any] | None:
-    """Speed and memory of the clips that were predicted in this run, without the first (warm-up).
+    """Speed and memory of the clips that were predicted in this run, but each process's first.
 
-    From decoded pictures to the fused episode. None where fewer than two were.
+    From decoded pictures to the fused episode. None where there are no others.
     """
-    timed = [clip for clip in clips if clip.seconds is not None][1:]
+    timed = [clip for clip in clips if clip.seconds is not None and not clip.warm_up]
     if not timed:
         return None
     frames, seconds = sum(c.frames for c in timed), sum(c.seconds or 0.0 for c in timed)

@@ -97,7 +97,8 @@ class ClipScorer:
 
     Args:
         clip: with its truth.
-        hand_model: turns predicted states into joints where they speak its shape space.
+        hand_model: turns the prediction's states into joints where they speak its shape space;
+            trivial rows do without, so that they are the same beside any prediction.
 
     """
 
@@ -125,10 +126,10 @@ class ClipScorer:
                     predicted.T_world_from_camera, truth.T_world_from_camera, truth.fps
                 )
             fov_true = K_to_fov_vh(clip.K, clip.image_size_hw)
-            fov_error = np.degrees(np.abs(predicted.fov_vh_rad[:, 1] - fov_true[1])).mean()
+            fov_error = np.degrees(np.abs(predicted.fov_vh_rad[:, 1] - fov_true[..., 1])).mean()
             by_reading, strata, world = {}, {}, {}
             if clip.hands:
-                joints = self._hands(predicted)
+                joints = self._hands(predicted, self.hand_model if row == "prediction" else None)
                 if row not in NO_HANDS:
                     by_reading = self._by_reading(predicted, joints)
                     strata = self._strata(joints)
@@ -146,8 +147,8 @@ class ClipScorer:
 
     # ------------------------------------------------------------------ parts
 
-    def _hands(self, predicted: Episode) -> Hands:
-        return _hands_of(predicted, model_for(predicted, self.clip, self.hand_model))
+    def _hands(self, predicted: Episode, given: HandModel | None) -> Hands:
+        return _hands_of(predicted, model_for(predicted, self.clip, given))
 
     @property
     def _truth(self) -> Hands:
@@ -204,10 +205,14 @@ class ClipScorer:
 def model_for(predicted: Episode, clip: Clip, given: HandModel | None = None) -> HandModel:
     """Return the hand that a prediction's joints are made with.
 
-    The given one, or else the truth's own, where the prediction's shape numbers mean something to
-    it; else the template, with its mean shape.
+    The truth's own where the prediction says that it was made with that one; else the given one, or
+    the truth's own, where the prediction's shape numbers mean something to it; else the template,
+    with its mean shape.
     """
-    for model in (given, clip.hand_model):
+    own = clip.hand_model
+    if (predicted.meta.get("hand_model"), _shape_space(predicted)) == (own.name, own.shape_space):
+        return own
+    for model in (given, own):
         if model is not None and model.shape_space == _shape_space(predicted):
             return model
     return HandModel.template()

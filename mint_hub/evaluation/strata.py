@@ -24,9 +24,9 @@ def strata_of(clip: Clip) -> dict[str, NDArray[np.bool_]]:
     """
     truth = clip.truth
     everywhere = np.ones(truth.presence.shape, bool)
-    fov_deg = float(np.degrees(K_to_fov_vh(clip.K, clip.image_size_hw)[1]))
+    fov_deg = np.degrees(K_to_fov_vh(clip.K, clip.image_size_hw)[..., 1])
     found = {f"source: {clip.source}": everywhere}
-    fov = np.full(truth.presence.shape, fov_deg)
+    fov = np.broadcast_to(fov_deg[..., None], truth.presence.shape)
     wrist = truth.wrist_camera()[..., 2, 3]
     found |= _binned("field of view", fov, FOV_EDGES_DEG, "degrees", 0)
     found |= _binned("wrist depth", wrist, DEPTH_EDGES_M, "m", 2)

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from mint_hub.evaluation.published import HEADING, PublishedTable, published_tables
-from mint_hub.evaluation.results import Results, Triple
+from mint_hub.evaluation.results import Results
 from mint_hub.evaluation.scoring import ALIGNMENTS
+from mint_hub.evaluation.summary import Triple
 from mint_hub.geometry.metrics import (
     FIELD_OF_VIEW,
     HAND_MEASURES,
@@ -44,7 +45,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells under columns; a row is "ours", "trivial", "published" or "stratum"."""
+    """Rows of cells under columns; a row is "ours", "trivial" or "published"."""
 
     title: str
     note: str
@@ -128,7 +129,7 @@ def write_markdown(results: Results, path: Path) -> Path:
     parts = [
         f"# {facts['title']}: {who}",
         f"{about}. mint-hub {results.mint_hub}, {results.date}. In brackets: 95 % of a bootstrap "
-        f"over clips. Mean hand: of {results.trained_on}.",
+        f"over recordings. Mean hand: of {results.trained_on}.",
         *(f"- {text}" for text in (*facts["notes"], *results.warnings)),
         *(table.markdown() for table in all_tables(results)),
     ]
@@ -202,7 +203,7 @@ def _hands(results: Results) -> tuple[Table, Table]:
 
 
 def _readings(results: Results) -> Table:
-    names = ("EPE-p", "CT-p", "CT-along-p")
+    names = ("EPE-p", "CT-p", "CT-along-p", "CT-lateral-p")
     columns: list[str] = []
     numbers: dict[str, dict[str, Any]] = {}
     for row, summary in results.summary.items():
@@ -226,22 +227,34 @@ def _readings(results: Results) -> Table:
 
 
 def _camera(results: Results) -> tuple[Table, Table]:
-    numbers = {r: s["camera"] for r, s in results.summary.items()}
+    numbers, cut = {r: s["camera"] for r, s in results.summary.items()}, _cut_note(results)
     step = _table(
         results,
         "Camera path, SE(3) alignment",
-        "From frame to frame, as the paper's tables are made; over clips that move.",
+        f"From frame to frame, as the paper's tables are made; over clips that move.{cut}",
         CAMERA_COLUMNS,
         numbers,
     )
     drift = _table(
         results,
         "Camera path, SE(3) alignment: scale and drift",
-        "ATE over a stretch of time is with a fit in every such stretch.",
+        f"ATE over a stretch of time is with a fit in every such stretch.{cut}",
         DRIFT_COLUMNS,
         numbers,
     )
     return step, drift
+
+
+def _cut_note(results: Results) -> str:
+    """What to know of camera numbers of sequences that were cut."""
+    frames = results.benchmark.get("clip_frames")
+    if frames is None:
+        return ""
+    return (
+        f" Each window of {frames} frames is a path of its own here, with an alignment of its own; "
+        "published camera numbers are of whole sequences: to read beside them, evaluate without "
+        "--clip-frames."
+    )
 
 
 def _camera_sim3(results: Results) -> Table:
@@ -252,6 +265,7 @@ def _camera_sim3(results: Results) -> Table:
     }
     columns = [f"{c} mean" for c in SIM3_COLUMNS]
     note = "The prediction is scaled to the truth first: shape without scale."
+    note += _cut_note(results)
     return _table(results, "Camera path, Sim(3) alignment", note, columns, numbers)
 
 
@@ -282,20 +296,17 @@ def _bin_order(item: tuple[str, Any]) -> tuple[str, float, str]:
 
 
 def _strata(results: Results) -> Table:
-    """The first row's numbers by bin."""
-    if not results.rows:
-        return Table("", "", (), (), ())
-    row = results.rows[0]
+    """Every bin with the numbers of each row that has hands of its own."""
     names = ("Recall", "F1", "MPJPE-p", "PA-MPJPE-p", "EPE-p", "GO-p", "CT-p")
-    rows = tuple(
-        (
-            name,
-            (
-                Cell(f"{found['hands']:,}"),
-                *(Cell(number(found[n], measure_of(n).unit), value=found[n]) for n in names),
-            ),
-        )
-        for name, found in _bins(results.summary[row]["strata"])
-    )
+    rows: list[tuple[str, tuple[Cell, ...]]] = []
+    kinds: list[str] = []
+    by_row = {r: s["strata"] for r, s in results.summary.items() if s["strata"]}
+    for bin_name, _ in _bins(next(iter(by_row.values()), {})):
+        for row, strata in by_row.items():
+            found = strata[bin_name]
+            cells = [Cell(number(found[n], measure_of(n).unit), value=found[n]) for n in names]
+            title = f"{bin_name} · {results.title(row)}"
+            rows.append((title, (Cell(f"{found['hands']:,}"), *cells)))
+            kinds.append("ours" if row == "prediction" else "trivial")
     heads = ("hands", *(measure_of(n).title for n in names))
-    return Table(f"By stratum: {results.title(row)}", "", heads, rows, ("stratum",) * len(rows))
+    return Table("By stratum", "", heads, tuple(rows), tuple(kinds))

@@ -13,12 +13,13 @@ import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mint_hub.assets import read_asset
+from mint_hub.conventions import ShapeSpace
 from mint_hub.geometry import hand_state as hands
 from mint_hub.geometry.rotations import mean_rotation
 from mint_hub.loaders.atomic import replacing
@@ -92,9 +93,7 @@ class MeanHand:
         """
         try:
             data = read_asset(MEAN_HAND_FILE) if path is None else path.read_bytes()
-            made = cls(**json.loads(data))
-            made.state()
-            return made
+            return cls(**json.loads(data)).checked()
         except FileNotFoundError:
             raise ValueError(f"{path}: expected a mean hand, found no file") from None
         except (TypeError, ValueError) as error:
@@ -110,10 +109,41 @@ class MeanHand:
 
     def state(self) -> NDArray[np.float32]:
         """(2, 109) hand states."""
-        state = np.asarray(self.hand_state, np.float32)
-        if state.shape != (2, hands.HAND_STATE_SIZE):
-            raise ValueError(f"hand_state: expected (2, 109), got {state.shape}")
-        return state
+        return np.asarray(self.hand_state, np.float32)
+
+    def checked(self) -> "MeanHand":
+        """Return itself.
+
+        Raises:
+            ValueError: a field has another shape or kind than it should, numbers that are not
+                finite or out of range, or a rotation that is none; names the field.
+
+        """
+        limits = {
+            "hand_state": ((2, hands.HAND_STATE_SIZE), -np.inf, np.inf),
+            "presence_rate": ((2,), 0.0, 1.0),
+            "fov_vh_rad": ((2,), 1e-3, np.pi - 1e-3),
+        }
+        for name, (shape, low, high) in limits.items():
+            try:
+                values = np.asarray(getattr(self, name), np.float64)
+            except (TypeError, ValueError):
+                raise ValueError(f"{name}: expected numbers {shape}, got others") from None
+            if values.shape != shape:
+                raise ValueError(f"{name}: expected {shape}, got {values.shape}")
+            if not (np.isfinite(values) & (values >= low) & (values <= high)).all():
+                raise ValueError(
+                    f"{name}: expected finite numbers from {low:g} to {high:g}, got "
+                    f"{values.min():g} to {values.max():g}"
+                )
+        if self.shape_space not in get_args(ShapeSpace):
+            raise ValueError(
+                f"shape_space: expected one of {get_args(ShapeSpace)}, got {self.shape_space!r}"
+            )
+        own = hands.unpack(self.state())
+        for decode in (own.orientation, own.joint_rotations):
+            decode()  # a degenerate rotation raises
+        return self
 
 
 def trivial_predictions(
@@ -176,9 +206,10 @@ def _late(truth: Episode, seen: NDArray[np.bool_]) -> Episode:
         presence_score=None,
         filled=None,
         text=(),
-        meta=_meta(truth, str(truth.meta.get("shape_space", "mint"))),
+        meta=_meta(truth, str(truth.meta.get("shape_space", "mint")), truth.meta.get("hand_model")),
     )
 
 
-def _meta(truth: Episode, shape_space: str) -> dict[str, Any]:
-    return {"source": "trivial", "fps": truth.fps, "shape_space": shape_space}
+def _meta(truth: Episode, shape_space: str, hand_model: Any = None) -> dict[str, Any]:
+    made = {"source": "trivial", "fps": truth.fps, "shape_space": shape_space}
+    return made if hand_model is None else {**made, "hand_model": hand_model}

@@ -197,11 +197,11 @@ def hand_statistics(
         Statistics in which nothing is NaN; without a present hand their pose sums and counts are 0.
 
     Raises:
-        ValueError: shapes that disagree, presence that is not boolean, numbers that are not finite
-            in a predicted or a valid hand, K or the canonical hand.
+        ValueError: no frame, shapes that disagree, presence that is not boolean, numbers that are
+            not finite in a predicted or a valid hand, K or the canonical hand.
 
     """
-    frames = len(np.asarray(truth.present))
+    frames = _num_frames(truth)
     guess, true = _checked("predicted", predicted, frames), _checked("truth", truth, frames)
     size_hw = require_image_size(image_size_hw)
     K_true = _intrinsics("K", K, frames)
@@ -243,7 +243,7 @@ def present_hands(truth: Hands, K: Any, image_size_hw: tuple[int, int]) -> Bools
         ValueError: as ``hand_statistics`` does.
 
     """
-    frames = len(np.asarray(truth.present))
+    frames = _num_frames(truth)
     true, size_hw = _checked("truth", truth, frames), require_image_size(image_size_hw)
     return np.asarray(_seen(true, _intrinsics("K", K, frames), size_hw)[1].any(axis=-1))
 
@@ -253,6 +253,13 @@ def _seen(true: Hands, K: Floats, image_size_hw: tuple[int, int]) -> tuple[Float
     pixels, _ = project(_in_front(true.joints), K)
     visible = np.asarray(on_screen(pixels, true.joints[..., 2], image_size_hw))
     return pixels, np.asarray(visible & true.present[..., None])
+
+
+def _num_frames(truth: Hands) -> int:
+    shape = np.shape(truth.present)
+    if len(shape) != 2 or shape[0] == 0:
+        raise ValueError(f"truth.present: expected (T, 2) with at least one frame, got {shape}")
+    return shape[0]
 
 
 def _checked(name: str, hands: Hands, frames: int) -> Hands:

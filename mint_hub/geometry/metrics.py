@@ -27,6 +27,7 @@ from mint_hub.geometry.trajectory_metrics import (
     TrajectoryStatistics,
     align_paths,
     associate,
+    ranked_sequences,
     trajectory_errors,
 )
 from mint_hub.geometry.world_hand_metrics import (
@@ -59,6 +60,7 @@ __all__ = [
     "none_for_nan",
     "number",
     "present_hands",
+    "ranked_sequences",
     "trajectory_errors",
     "world_hand_statistics",
 ]

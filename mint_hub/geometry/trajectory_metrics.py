@@ -8,7 +8,7 @@ RGB-D benchmark); RPE and ATE equal those of the ``evo`` package.
 Sequences are not pooled: each has its numbers, and a corpus their means and medians.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from math import fsum, isnan, nan
 from statistics import median
@@ -159,10 +159,12 @@ class TrajectoryStatistics:
     def metrics(self, with_degenerate: bool = False) -> dict[str, float]:
         """Mean and median over sequences of every measure, and how many sequences there are.
 
-        Degenerate sequences are counted and left out, but ``with_degenerate`` lets them in: a row
-        that never moves the camera has no others. A measure that no sequence has is NaN.
+        Degenerate sequences are counted and left out, but ``with_degenerate`` lets in those that
+        only the prediction makes so, see ``ranked_sequences``. A measure that no sequence has is
+        NaN.
         """
-        rows = [s.values() for s in self.sequences if with_degenerate or not s.degenerate]
+        counts = ranked_sequences(self.sequences, with_degenerate)
+        rows = [s.values() for s, own in zip(self.sequences, counts, strict=True) if own]
         found: dict[str, float] = {
             "sequences": len(self.sequences),
             "degenerate": sum(s.degenerate for s in self.sequences),
@@ -182,6 +184,20 @@ class TrajectoryStatistics:
         """Invert ``to_dict``."""
         require_fields(cls, values)
         return cls(tuple(TrajectoryErrors.from_dict(s) for s in values["sequences"]))
+
+
+def ranked_sequences(
+    sequences: Sequence[TrajectoryErrors], with_degenerate: bool = False
+) -> list[bool]:
+    """Say which sequences count in a mean: those that are not degenerate.
+
+    A row that never moves the camera has no such sequence. ``with_degenerate`` lets in every one
+    whose true camera moves, which are those that any other row is ranked on; all where none does.
+    """
+    if not with_degenerate:
+        return [not s.degenerate for s in sequences]
+    moving = [s.true_path_m >= DEGENERATE_PATH_M for s in sequences]
+    return moving if any(moving) else [True] * len(sequences)
 
 
 def trajectory_errors(predicted: Any, truth: Any, fps: float = MODEL_FPS) -> TrajectoryErrors:

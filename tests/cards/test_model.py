@@ -121,6 +121,48 @@ def test_evaluations_of_the_same_clips_share_a_table(folder, results):
     assert "model-index" not in card_head(load_results(folder))
 
 
+def test_a_card_is_of_one_checkpoint(folder, results):
+    """huggingface_hub reads all entries of an index as one model's."""
+    other = json.loads(json.dumps(results))
+    other["prediction"]["name"] = other["rows"][0]["name"] = "mint-tiny"
+    with pytest.raises(CardError, match=r"expected evaluations of one .* mint-small .* mint-tiny"):
+        card_head([results, other])
+    retrained = json.loads(json.dumps(results))
+    retrained["prediction"]["weights"] = "f" * 16
+    with pytest.raises(CardError, match=r"got 2: mint-small .0123456789abcdef., mint-small .ffff"):
+        render_two(folder, results, retrained)
+    elsewhere = json.loads(json.dumps(results))
+    elsewhere["benchmark"].update(name="bench", hash="1" * 16)
+    index = card_head([results, elsewhere])["model-index"]
+    assert [entry["name"] for entry in index] == ["mint-small"]
+
+
+def render_two(folder, one, other):
+    (folder / "results").mkdir(exist_ok=True)
+    for name, values in (("one", one), ("other", other)):
+        (folder / "results" / f"{name}.json").write_text(json.dumps(values))
+    return render(folder)
+
+
+@pytest.mark.parametrize(
+    ("facts", "name"),
+    [
+        ({"name": "shards", "config": "ego4d", "split": "validation"}, "shards-ego4d-validation"),
+        ({"name": "arctic", "protocol": "p1", "split": "val"}, "arctic-val-p1"),
+        ({"name": "hot3d", "clip_frames": 81}, "hot3d-81-frames"),
+    ],
+)
+def test_evaluations_of_other_clips_do_not_replace_each_other(
+    folder, results, tmp_path, facts, name
+):
+    made = tmp_path / "evaluation"
+    made.mkdir()
+    values = {**results, "benchmark": {**results["benchmark"], **facts}}
+    (made / "results.json").write_text(json.dumps(values))
+    (made / "tables.md").write_text("# all\n")
+    assert keep_results(made, folder).name == f"{name}-mint-small.json"
+
+
 def test_results_are_kept_without_their_clips(folder, results, tmp_path):
     made = tmp_path / "evaluation"
     made.mkdir()

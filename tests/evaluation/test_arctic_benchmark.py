@@ -1,6 +1,8 @@
 """ARCTIC from files made to its published layout: mean pose, left hand, lens, offsets."""
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,9 +14,13 @@ from scipy.spatial.transform import Rotation
 from mint_hub.conventions import SIDES
 from mint_hub.evaluation.benchmarks import open_benchmark
 from mint_hub.evaluation.clips import BenchmarkError, MissingFilesError, Source
+from mint_hub.evaluation.evaluate import evaluate
+from mint_hub.evaluation.predictor import Predictor
 from mint_hub.evaluation.scoring import ClipScorer
 from mint_hub.geometry.camera import project
+from mint_hub.geometry.hand_model import HandModel
 from mint_hub.geometry.lenses import OpenCVLens
+from tests.evaluation_data import save_all
 from tests.geometry.test_mano_files import mano_fields, smplx_hand, write_mano
 
 T = 12
@@ -95,6 +101,62 @@ def test_joints_are_where_manos_own_code_puts_them(tmp_path, mano_dir):
         assert_allclose(world[:, hand, 0], expected[:, 0], atol=1e-6)
         assert_allclose(world[:, hand, 5:8], expected[:, 1:4], atol=1e-5)
     assert ClipScorer(clip).score(clip.truth).hands["published"].metrics()["FAcc"] == 1
+
+
+def test_truth_is_ideal_and_rows_are_the_same_beside_any_prediction(tmp_path, mano_dir):
+    """The truth's hand is ARCTIC's, whatever hand --mano would give a prediction."""
+    arctic(tmp_path / "download")
+    source = Source("arctic", str(tmp_path / "download"), mano_dir=str(mano_dir))
+    truth = open_benchmark(source).clip(0).truth
+    labels = save_all([truth], tmp_path / "labels")
+    beside = evaluate(source, Predictor.of(str(labels), mano_dir=str(mano_dir)))
+    own = beside.summary["prediction"]["hands"]["published"]
+    for name in ("MPJPE-p", "PA-MPJPE-p", "EPE-p", "GO-p", "CT-p"):
+        assert own[name][0] == pytest.approx(0, abs=1e-9)
+    alone = evaluate(source)
+    for row in alone.rows:
+        ours, theirs = (r.summary[row]["hands"].get("published", {}) for r in (alone, beside))
+        np.testing.assert_equal(theirs, ours)
+    other = replace(truth, meta={**truth.meta, "hand_model": "mano"})  # repaired, as a network's
+    labels = save_all([other], tmp_path / "other")
+    found = evaluate(source, Predictor.of(str(labels), mano_dir=str(mano_dir)))
+    assert found.summary["prediction"]["hands"]["published"]["MPJPE-p"][0] > 0.1
+
+
+def test_the_truth_is_the_same_without_its_pictures_and_in_a_copy(tmp_path, mano_dir):
+    arctic(tmp_path / "a")
+    sources = [Source("arctic", str(tmp_path / n), mano_dir=str(mano_dir)) for n in ("a", "b")]
+    one = open_benchmark(sources[0]).clip(0)
+    shutil.copytree(tmp_path / "a", tmp_path / "b", copy_function=shutil.copyfile)
+    two = open_benchmark(sources[1]).clip(0)
+    assert two.truth_stamp() == one.truth_stamp()
+    assert two.stamp() != one.stamp()
+    shutil.rmtree(tmp_path / "b/arctic_data/data/cropped_images")
+    assert open_benchmark(sources[1]).clip(0).truth_stamp() == one.truth_stamp()
+    repaired = replace(one, hand_model=HandModel.from_mano(mano_dir))
+    assert repaired.truth_stamp() != one.truth_stamp()
+
+
+def test_lengths_are_known_without_the_hands(tmp_path, mano_dir, monkeypatch):
+    arctic(tmp_path)
+    folder = tmp_path / "arctic_data/data/cropped_images/s05/box_use_01/0"
+    (folder / f"{OFFSET:05d}.jpg").unlink()
+    source = Source("arctic", str(tmp_path), mano_dir=str(mano_dir), clip_frames=5)
+    assert open_benchmark(source).clip(2).truth.num_frames == 1
+    monkeypatch.setattr("mint_hub.evaluation.bench_arctic.hand_states", None)
+    benchmark = open_benchmark(source)
+    assert [benchmark.num_frames(i) for i in range(len(benchmark))] == [5, 5, 1]
+    monkeypatch.undo()
+    greys = [int(image[240, 336, 0]) for image in benchmark.clip(1).frames.images(2)]
+    assert_allclose(greys, 10 * np.arange(8, 11), atol=2)
+
+
+def test_a_subject_without_an_offset_is_told_where_it_stands(tmp_path):
+    arctic(tmp_path)
+    (tmp_path / "arctic_data/data/meta/misc.json").write_text("{}")
+    clip = open_benchmark(Source("arctic", str(tmp_path))).clip(0)
+    assert clip.frames is None
+    assert "misc.json: expected ioi_offset of s05" in clip.without_frames
 
 
 def test_pictures_are_undistorted_to_the_sequences_scaled_camera(tmp_path):

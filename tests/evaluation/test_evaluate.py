@@ -1,5 +1,6 @@
 """An evaluation end to end on saved labels: laws of its numbers, and one clear error each."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,16 +13,16 @@ from mint_hub.evaluation.predictor import Predictor
 from mint_hub.evaluation.results import Results, ResultsError
 from mint_hub.evaluation.scoring import ClipScorer
 from mint_hub.evaluation.strata import strata_of
-from mint_hub.evaluation.trivial import TRIVIAL, MeanHand, trivial_predictions
+from mint_hub.evaluation.trivial import TRIVIAL
 from mint_hub.geometry import rigid
 from mint_hub.geometry.metrics import HAND_MEASURES, HandStatistics
 from mint_hub.inference.known_camera import correct_translation
-from mint_hub.loaders.schema import Episode
 from mint_hub.loaders.shards import write_corpus
 from mint_hub.synth.presets import BENCH_CLIPS, GENERATOR
 from tests.evaluation_data import moved, noisy, save_all, true_episode, without_hands
 
 COUNT = 4
+WORDS = ("mean", "median")
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +90,14 @@ def test_file_is_read_back_whole(results, tmp_path):
     path.write_text(path.read_text().replace('"tp"', '"tq"', 1))
     with pytest.raises(ResultsError, match=r"a\.json: expected schema 1 whole, .*unknown \['tq'\]"):
         Results.load(path)
+    path.write_text('{"kind": "mint-hub evaluation"}')
+    with pytest.raises(ResultsError, match=r"a\.json: schema: expected 1, got None"):
+        Results.load(path)
+    bare = results.to_dict()
+    bare["clips"][0]["scores"] = []
+    path.write_text(json.dumps(bare))
+    with pytest.raises(ResultsError, match=r"a\.json: expected schema 1 whole, .*by row, got \[\]"):
+        Results.load(path)
     path.write_text('{"kind": "other"}')
     with pytest.raises(ResultsError, match="expected results of `mint-hub evaluate`"):
         Results.load(path)
@@ -97,8 +106,12 @@ def test_file_is_read_back_whole(results, tmp_path):
 
 
 def test_intervals_hold_the_value_and_one_clip_has_none(results, source, spoilt):
-    for triple in results.summary["prediction"]["hands"]["published"].values():
-        assert np.isnan(triple[1]) or triple[1] <= triple[0] <= triple[2]
+    own = results.summary["prediction"]
+    held = [*own["hands"]["published"].values(), *own["world"]["SE(3)"].values()]
+    held += [own["camera"][f"{name} {word}"] for name in ("ATE", "RPE-T") for word in WORDS]
+    for value, low, high in held:
+        assert low <= value <= high
+        assert np.isfinite([low, high]).all()
     alone = evaluate(replace(source, limit=1), Predictor.of(str(spoilt)))
     value, low, high = alone.summary["prediction"]["hands"]["published"]["EPE-p"]
     assert np.isfinite(value)
@@ -177,42 +190,6 @@ def test_shapes_of_a_space_without_its_hand_are_the_mean_shape(source, truth):
     assert ours.hands["published"] != got
 
 
-# ------------------------------------------------------------------------- trivial rows
-
-
-def test_last_frame_is_the_truth_one_frame_late(truth):
-    late = trivial_predictions(truth[0], MeanHand.load())["last frame copied"]
-    assert np.array_equal(late.hand_state[1:], truth[0].hand_state[:-1])
-    assert np.array_equal(late.T_camera_from_world[1:], truth[0].T_camera_from_world[:-1])
-
-
-def test_mean_hand_of_one_constant_clip_is_that_hand(truth, tmp_path):
-    state = np.tile(truth[0].hand_state[20:21], (30, 1, 1))
-    constant = replace(
-        truth[0].window(0, 30), hand_state=state, presence=np.ones((30, 2), bool), text=()
-    )
-    mean = MeanHand.of([constant], "one clip", step=1)
-    np.testing.assert_allclose(mean.state(), state[0], atol=2e-6)
-    assert mean.presence_rate == [1, 1]
-    assert MeanHand.load(mean.save(tmp_path / "m.json")) == mean
-    (tmp_path / "m.json").write_text('{"frames": 3}')
-    with pytest.raises(ValueError, match=r"m\.json: expected a mean hand"):
-        MeanHand.load(tmp_path / "m.json")
-    with pytest.raises(ValueError, match=r"none\.json: expected a mean hand, found no file"):
-        MeanHand.load(tmp_path / "none.json")
-    with pytest.raises(ValueError, match="expected frames with each hand"):
-        MeanHand.of([without_hands(truth[0])], "none")
-
-
-def test_hands_by_lot_are_the_same_every_time_and_as_frequent_as_said(truth):
-    mean = replace(MeanHand.load(), presence_rate=[0.25, 1.0])
-    long = true_episode(0, 400)
-    one, two = (trivial_predictions(long, mean)["mean hand"] for _ in range(2))
-    assert np.array_equal(one.presence, two.presence)
-    assert one.presence[:, 0].mean() == pytest.approx(0.25, abs=0.08)
-    assert one.presence[:, 1].all()
-
-
 # ---------------------------------------------------------------------------- bad input
 
 
@@ -264,6 +241,24 @@ def test_a_prediction_that_does_not_move_is_told(source, truth, tmp_path):
     assert not evaluate(source).warnings  # zero camera motion is no prediction of anyone's
 
 
+def test_zero_motion_is_averaged_over_the_clips_that_move(truth, tmp_path):
+    """Its error on a camera that does not move is no merit: no other row is ranked there."""
+    still = [
+        replace(e, T_camera_from_world=np.tile(e.T_camera_from_world[:1], (60, 1, 1)))
+        for e in truth[:3]
+    ]
+    clips = [*still, truth[3]]
+    source = Source("labels", str(save_all(clips, tmp_path / "still")))
+    labels = save_all([noisy(e, 0.002, i) for i, e in enumerate(clips)], tmp_path / "labels")
+    found = evaluate(source, Predictor.of(str(labels)))
+    alone = found.clips[3].scores["zero camera motion"].camera
+    assert alone is not None
+    row = found.summary["zero camera motion"]["camera"]
+    assert row["RPE-T mean"][0] == pytest.approx(alone.se3.rpe_translation_mm)
+    assert row["RPE-T median"][0] == pytest.approx(alone.se3.rpe_translation_mm)
+    assert np.isnan(row["RPE-T mean"][1:]).all()  # of one clip
+
+
 def test_worlds_do_not_matter(source, truth, results, tmp_path):
     """A prediction may live in any world: moving it as a whole changes no number."""
     move = rigid.se3_exp(np.array([0.4, -1.1, 2.0, 3.0, -2.0, 5.0]))
@@ -309,22 +304,6 @@ def test_folders_without_anything_are_named(source, tmp_path):
         evaluate(Source("labels", str(tmp_path)), jobs=0)
     with pytest.raises(ValueError, match="limit: expected at least 1, got 0"):
         Source("labels", str(tmp_path), limit=0)
-
-
-def test_truth_that_zooms_is_refused(truth, tmp_path):
-    fov = np.array(truth[0].fov_vh_rad)
-    fov[30:] += 0.1
-    folder = save_all([replace(truth[0], fov_vh_rad=fov)], tmp_path / "zoom")
-    with pytest.raises(BenchmarkError, match="clip-0: expected one field of view"):
-        open_benchmark(Source("labels", str(folder))).clip(0)
-
-
-def test_clip_stamp_follows_the_truth(source, truth):
-    clip = clip_of(source)
-    assert clip.stamp() == clip_of(source).stamp()
-    other = replace(clip, truth=noisy(truth[0], 0.001))
-    assert other.stamp() != clip.stamp()
-    assert isinstance(other.truth, Episode)
 
 
 def test_a_kept_bench_is_opened_and_another_is_refused(truth, tmp_path):

@@ -100,7 +100,7 @@ def test_hands_off_screen_are_no_false_alarm_of_the_last_frame(real, mano_dir):
 def test_real_cameras_are_ideal_against_themselves_and_off_by_the_shift(real, tmp_path):
     source = Source("hot3d", str(real))
     clip = open_benchmark(source).clip(0)
-    assert clip.truth.num_frames == 34
+    assert clip.truth.num_frames == 34 == open_benchmark(source).num_frames(0)
     assert clip.truth.image_size_hw == SIZE_HW == clip.image_size_hw
     assert_allclose(clip.K, [[207.8, 0, 239.8], [0, 207.8, 239.8], [0, 0, 1]])
     assert not clip.hands
@@ -126,6 +126,8 @@ def test_real_hands_score_with_files_in_manos_format(real, mano_dir):
     clip = open_benchmark(Source("hot3d", str(real), mano_dir=mano_dir)).clip(0)
     assert clip.hands
     assert clip.hand_model.shape_space == "mano"
+    assert clip.truth.meta["hand_model"] == clip.hand_model.name
+    assert open_benchmark(Source("hot3d", str(real), mano_dir=mano_dir)).num_frames(0) == 34
     own, far = (
         ClipScorer(clip).score(e).hands["published"].metrics()
         for e in (clip.truth, moved(clip.truth, 0.1))

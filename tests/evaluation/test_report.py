@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mint_hub.evaluation.bench_shards import clip_of
 from mint_hub.evaluation.benchmarks import open_benchmark
 from mint_hub.evaluation.clips import Source
 from mint_hub.evaluation.evaluate import evaluate
@@ -20,8 +21,10 @@ from mint_hub.evaluation.figures import (
 from mint_hub.evaluation.predictor import Predictor
 from mint_hub.evaluation.published import published_tables
 from mint_hub.evaluation.report import worst_clips, write_report
+from mint_hub.evaluation.scoring import ClipScorer
 from mint_hub.evaluation.tables import all_tables, main_tables, published
 from mint_hub.evaluation.trivial import TRIVIAL
+from mint_hub.geometry.hand_state import absent
 from mint_hub.geometry.metrics import HAND_MEASURES
 from mint_hub.loaders.clips import encode_clip
 from mint_hub.loaders.packing import MP4
@@ -65,9 +68,33 @@ def test_every_table_has_the_trivial_rows(made):
     found = {name for table in tables.values() for name, _ in table.rows}
     assert set(TRIVIAL) <= found
     for title, table in tables.items():
-        if not title.startswith("By stratum"):
+        if title != "By stratum":
             assert table.kinds.count("ours") == 1
             assert table.kinds.count("trivial") >= 2
+
+
+def test_every_bin_of_a_stratum_has_the_trivial_rows(made):
+    results = made[2]
+    table = next(t for t in all_tables(results) if t.title == "By stratum")
+    assert table.kinds[:4] == ("ours", "trivial", "trivial", "trivial")
+    bins = [name.rpartition(" · ")[0] for name, _ in table.rows]
+    whos = [name.rpartition(" · ")[2] for name, _ in table.rows]
+    assert whos == ["off <b>", "mean hand", "always present", "last frame copied"] * (
+        len(bins) // 4
+    )
+    assert all(bins[i] == bins[i // 4 * 4] for i in range(len(bins)))
+    name, cells = table.rows[2]
+    own = results.summary["always present"]["strata"][bins[2]]
+    assert cells[-1].value == own["CT-p"]
+    assert f"| {name} |" in table.markdown()
+
+
+def test_what_is_known_of_the_camera_is_told_along_and_across_the_ray(made):
+    """A wrong focal length moves a hand along the ray; what is left across it is the network's."""
+    table = next(t for t in all_tables(made[2]) if t.title.startswith("Hands by what is known"))
+    for name in ("CT-p", "CT-along-p", "CT-lateral-p"):
+        for reading in ("published", "known"):
+            assert f"{name}, {reading} (m)" in table.columns
 
 
 def test_columns_without_a_number_are_left_out(made):
@@ -150,6 +177,26 @@ def test_truth_and_prediction_are_drawn_side_by_side(made):
     paths = path_figure(clip, predicted)
     assert paths.shape == (360, 360, 3)
     assert len(np.unique(paths.reshape(-1, 3), axis=0)) > 3
+
+
+def test_the_worst_frame_is_by_what_is_scored(made):
+    """A valid hand off screen is no miss, as motion capture has it, nor made up where predicted."""
+    truth = true_episode(0, 30)
+    state = truth.hand_state.copy()
+    state[:15, :, 0] = np.where(truth.presence[:15], 9.0, state[:15, :, 0])
+    truth = replace(truth, hand_state=state)
+    clip = clip_of(truth, None, None)
+    seen = ClipScorer(clip).seen()
+    assert not seen[:15].any()
+    (wrong,) = np.flatnonzero(seen.all(axis=1))[-1:]
+    bad = np.where(seen[..., None], state, absent(seen.shape))
+    bad[wrong, :, 2] += 0.02
+    assert worst_frame(clip, replace(truth, hand_state=bad, presence=seen)) == wrong
+    bad = state.copy()
+    bad[wrong, :, 2] += 0.02
+    assert worst_frame(clip, replace(truth, hand_state=bad)) == wrong
+    missed = replace(truth, hand_state=absent(seen.shape), presence=np.zeros_like(seen))
+    assert seen[worst_frame(clip, missed)].all()
 
 
 def test_bars_are_as_high_as_their_values():

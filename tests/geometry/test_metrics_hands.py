@@ -460,3 +460,11 @@ def test_bad_input_is_named() -> None:
     del values["tp"]
     with pytest.raises(ValueError, match=r"missing \['tp'\] and unknown \['x'\]"):
         HandStatistics.from_dict({**values, "x": 0})
+
+
+def test_clips_without_a_frame_are_refused() -> None:
+    none = random_hands(np.random.default_rng(0), 0)
+    with pytest.raises(ValueError, match=r"truth\.present: expected .* at least one frame"):
+        score(none, none)
+    with pytest.raises(ValueError, match=r"truth\.present: expected .* at least one frame"):
+        present_hands(none, np.eye(3), (10, 10))

@@ -18,6 +18,7 @@ from mint_hub.geometry.metrics import (
     TrajectoryStatistics,
     align_paths,
     associate,
+    ranked_sequences,
     trajectory_errors,
 )
 from mint_hub.geometry.rotations import quat_xyzw_to_matrix, rotvec_to_matrix
@@ -264,6 +265,19 @@ def test_zero_motion_is_reported_and_not_ranked() -> None:
     assert isnan(other.arc_length_ratio)
     assert isnan(other.se3.ate_percent)
     assert isnan(other.log_scale_1s)
+
+
+def test_a_row_that_never_moves_is_not_averaged_over_cameras_that_do_not() -> None:
+    """Where the true camera is still, zero motion errs by nothing, and nobody else is ranked."""
+    still, truth = straight(40, 0.0), straight(40)
+    row = [trajectory_errors(still, path, fps=10) for path in (truth, still, still)]
+    assert ranked_sequences(row) == [False] * 3
+    assert ranked_sequences(row, with_degenerate=True) == [True, False, False]
+    metrics = TrajectoryStatistics(tuple(row)).metrics(with_degenerate=True)
+    assert metrics["RPE-T mean"] == metrics["RPE-T median"] == pytest.approx(100)
+    assert (metrics["sequences"], metrics["degenerate"]) == (3, 3)
+    alone = TrajectoryStatistics(tuple(row[1:])).metrics(with_degenerate=True)
+    assert alone["RPE-T mean"] == 0
 
 
 def test_a_single_frame_has_no_relative_pose() -> None:
