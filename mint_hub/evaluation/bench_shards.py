@@ -28,26 +28,26 @@ class ShardsBenchmark(Benchmark):
     def __init__(self, source: Source, title: str | None = None) -> None:
         config, split = _choice(Path(source.root), source.config, source.split)
         self.source = replace(source, config=config, split=split)  # results say which
-        self._reader = CorpusReader(source.root, config, split)
-        self._packed = VIDEO_MEMBER in self._reader.manifest.members
+        self.reader = CorpusReader(source.root, config, split)
+        self._packed = VIDEO_MEMBER in self.reader.manifest.members
         self.title = title or f"{config}/{split}"
-        if not len(self._reader):
+        if not len(self.reader):
             raise BenchmarkError(f"{source.root}: {config}/{split}: expected episodes, found none")
 
     def __len__(self) -> int:
-        return len(self._reader)
+        return len(self.reader)
 
     def num_frames(self, i: int) -> int:
         """Return the length of clip ``i``, from the index."""
-        return int(self._reader.num_frames[i])
+        return int(self.reader.num_frames[i])
 
     def clip(self, i: int) -> Clip:
         """Read clip ``i``."""
         frames = None
         if self._packed:
-            frames = PackedFrames(bytes(self._reader.member(i, VIDEO_MEMBER)))
+            frames = PackedFrames(bytes(self.reader.member(i, VIDEO_MEMBER)))
         why = "" if frames else f"{self.title} has no packed video: see `mint-hub pack`"
-        return clip_of(self._reader[i], frames, self.source.mano_dir, why)
+        return clip_of(self.reader[i], frames, self.source.mano_dir, why)
 
 
 class LabelsBenchmark(Benchmark):
@@ -81,26 +81,34 @@ def synthetic_benchmark(source: Source, num_procs: int = 1) -> ShardsBenchmark:
 
     Raises:
         ImportError, RuntimeError: the renderer is missing; the message says what to install.
-        BenchmarkError: other clips lie there.
+        BenchmarkError: other clips lie there than were frozen.
 
     """
     from mint_hub.synth.episodes import synthesise
-    from mint_hub.synth.gl import make_context
-    from mint_hub.synth.presets import GENERATOR, preset_named
+    from mint_hub.synth.frozen import require_frozen
+    from mint_hub.synth.presets import GENERATOR, REVISION, preset_named
 
-    folder = Path(source.root) / f"generator-{GENERATOR}"
+    generator = f"generator-{GENERATOR}.{REVISION}"
+    folder = Path(source.root) / generator
     config = f"synth-{source.name}"
     if not (folder / config / "validation" / MANIFEST).is_file():
-        make_context().release()  # say what is missing before a world is made
         synthesise(folder, source.name, num_procs=num_procs, progress=True)
     opened = replace(source, root=str(folder), config=config, split="validation")
-    benchmark = ShardsBenchmark(opened, title=f"mint-hub {source.name}, generator {GENERATOR}")
+    title = f"mint-hub {source.name}, generator {GENERATOR}.{REVISION}"
+    benchmark = ShardsBenchmark(opened, title=title)
     expected = preset_named(source.name).clips
     if len(benchmark) != expected:
         raise BenchmarkError(
             f"{folder / config}: expected the {expected} clips of {source.name}, got "
             f"{len(benchmark)}: remove the folder to have them drawn again"
         )
+    try:
+        for i in range(expected):
+            require_frozen(source.name, i, benchmark.reader[i])
+    except ValueError as error:
+        raise BenchmarkError(
+            f"{folder / config}: {error}: remove the folder to have them drawn again"
+        ) from error
     benchmark.source = source
     benchmark.notes = ("synthetic clips: exact truth, drawn pictures",)
     return benchmark

@@ -52,6 +52,7 @@ __all__ = [
     "DEPTH_STEP_M",
     "Clip",
     "draw_corruption",
+    "labels_of",
     "make_clip",
     "make_episode",
     "presence_of",
@@ -142,7 +143,7 @@ def make_episode(
         members[DEPTH] = _npz("depth", np.stack(kept.depths))
     if segmentation:
         members[SEGMENTATION] = _npz("segmentation", np.stack(kept.segments))
-    return Clip(_labels(world, np.stack(kept.visible), settings), members)
+    return Clip(labels_of(world, np.stack(kept.visible), settings), members)
 
 
 @dataclass(eq=False)
@@ -180,9 +181,20 @@ class _Kept:
         return (seen / np.maximum(alone, 1)).astype(np.float32)
 
 
-def _labels(world: World, visible: NDArray[np.float32], settings: Corruption) -> Episode:
+def labels_of(world: World, visible: NDArray[np.float32] | None, settings: Corruption) -> Episode:
+    """Make the labels of a world.
+
+    Args:
+        world: whose clip it is.
+        visible: (T, 2) share of each hand that nothing hides; None: no ``presence_score``.
+        settings: the camera's, for the record.
+
+    """
     presence = presence_of(world)
     state = np.where(presence[..., None], world.hands.hand_state, absent(presence.shape))
+    score = None
+    if visible is not None:
+        score = np.where(presence, np.clip(visible, 0.0, 1.0), 0).astype(np.float32)
     fov_vh_rad, size_hw = pinhole_of(world)
     lens = {} if world.lens is None else {"lens": world.lens.to_dict()}
     return Episode(
@@ -192,7 +204,7 @@ def _labels(world: World, visible: NDArray[np.float32], settings: Corruption) ->
         fov_vh_rad=np.tile(fov_vh_rad.astype(np.float32), (world.num_frames, 1)),
         hand_state=state.astype(np.float32),
         presence=presence,
-        presence_score=np.where(presence, np.clip(visible, 0.0, 1.0), 0).astype(np.float32),
+        presence_score=score,
         image_size_hw=size_hw,
         text=world.text,
         meta={

@@ -4,7 +4,7 @@
 and how far its camera and its wrists go. A change of the generator that moves anything moves the
 last two; what differs between machines by rounding does not.
 
-    python -m mint_hub.synth.frozen CORPUS      # writes the file from benches as drawn
+    python -m mint_hub.synth.frozen      # writes the file, in a minute or two
 """
 
 from __future__ import annotations
@@ -109,20 +109,23 @@ def frozen_list(clips: Iterable[tuple[str, FrozenClip]]) -> str:
 
 
 def main() -> None:
-    """Write the list among the assets from a corpus that holds both benches as drawn."""
-    from mint_hub.loaders.reader import CorpusReader
+    """Make the worlds of both benches and write the list among the assets, or to ``--out``."""
+    from tqdm.auto import tqdm
+
+    from mint_hub.synth.corruption import Corruption
+    from mint_hub.synth.episodes import labels_of
     from mint_hub.synth.presets import PRESETS
+    from mint_hub.synth.scene import make_world
 
     parser = argparse.ArgumentParser(description="Freeze the synthetic benches.")
-    parser.add_argument("corpus", type=Path, help="made by `mint-hub synth --preset` for both")
     parser.add_argument("--out", type=Path, default=asset_path(BENCH_FILE))
-    given = parser.parse_args()
-    clips: list[tuple[str, FrozenClip]] = []
-    for preset in PRESETS.values():
-        if preset.clips is not None:
-            drawn = CorpusReader(given.corpus, f"synth-{preset.name}", "validation")
-            clips += [(f"{preset.name}/{i}", frozen_clip(drawn[i])) for i in range(preset.clips)]
-    given.out.write_text(frozen_list(clips))
+    out: Path = parser.parse_args().out
+    names = [(p.name, n) for p in PRESETS.values() for n in range(p.clips or 0)]
+    clips = [
+        (f"{preset}/{n}", frozen_clip(labels_of(make_world(n, preset), None, Corruption())))
+        for preset, n in tqdm(names, unit="clip")
+    ]
+    out.write_text(frozen_list(clips))
 
 
 if __name__ == "__main__":

@@ -145,11 +145,24 @@ def grasp_of(
             are in other things.
 
     """
+    own = _best_grasp(person, side, thing, T_work_from_thing, avoid, habits=True)
+    return own or _best_grasp(person, side, thing, T_work_from_thing, avoid, habits=False)
+
+
+def _best_grasp(
+    person: Person,
+    side: Side,
+    thing: Thing,
+    T_work_from_thing: Floats,
+    avoid: Avoid | None,
+    habits: bool,
+) -> Grasp | None:
+    """Fit the easiest grips, begun as the person would, or as everybody does."""
     floor = -float(T_work_from_thing[2, 3])
     options: list[tuple[float, int, Floats, Floats, Grip]] = []
     for grip in thing.grips:
         angles = posture_for(person.proxy, grip.style, grip.width)
-        if grip.style != "flat":
+        if habits and grip.style != "flat":
             angles = person.grip(angles, side, thing)
         for begin in _starts(person, side, grip, angles, T_work_from_thing):
             effort = person.effort(side, T_work_from_thing @ begin)

@@ -18,7 +18,8 @@ from mint_hub.geometry import rigid
 from mint_hub.geometry.metrics import HAND_MEASURES, HandStatistics
 from mint_hub.inference.known_camera import correct_translation
 from mint_hub.loaders.shards import write_corpus
-from mint_hub.synth.presets import BENCH_CLIPS, GENERATOR
+from mint_hub.synth.frozen import frozen_clip
+from mint_hub.synth.presets import BENCH_CLIPS, GENERATOR, REVISION
 from tests.evaluation_data import moved, noisy, save_all, true_episode, without_hands
 
 COUNT = 4
@@ -306,14 +307,18 @@ def test_folders_without_anything_are_named(source, tmp_path):
         Source("labels", str(tmp_path), limit=0)
 
 
-def test_a_kept_bench_is_opened_and_another_is_refused(truth, tmp_path):
+def test_a_kept_bench_is_opened_and_another_is_refused(truth, tmp_path, monkeypatch):
     short = truth[0].window(0, 2)
     every = [replace(short, key=f"synth-bench-{k}") for k in range(BENCH_CLIPS)]
-    folder = tmp_path / f"generator-{GENERATOR}"
+    folder = tmp_path / f"generator-{GENERATOR}.{REVISION}"
     write_corpus(every, folder, "synth-bench", "validation", format="lossless", extra=True)
+    with pytest.raises(BenchmarkError, match="bench/0: expected the clip of generator"):
+        open_benchmark(Source("bench", str(tmp_path)))
+    known = {f"bench/{k}": frozen_clip(short) for k in range(BENCH_CLIPS)}
+    monkeypatch.setattr("mint_hub.synth.frozen.frozen_clips", lambda: known)
     benchmark = open_benchmark(Source("bench", str(tmp_path)))
     assert len(benchmark) == BENCH_CLIPS
-    assert f"generator {GENERATOR}" in benchmark.title
+    assert f"generator {GENERATOR}.{REVISION}" in benchmark.title
     assert benchmark.source.root == str(tmp_path)
     write_corpus(every[:3], folder, "synth-bench-ood", "validation", format="lossless", extra=True)
     with pytest.raises(BenchmarkError, match="expected the 40 clips of bench-ood, got 3"):

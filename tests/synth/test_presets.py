@@ -8,7 +8,8 @@ import pytest
 from mint_hub.geometry.hand_state import unpack
 from mint_hub.synth.activities import TRAIN
 from mint_hub.synth.activities_ood import OOD
-from mint_hub.synth.episodes import presence_of
+from mint_hub.synth.corruption import Corruption
+from mint_hub.synth.episodes import labels_of
 from mint_hub.synth.frozen import require_frozen
 from mint_hub.synth.presets import (
     BENCH_CLIPS,
@@ -95,16 +96,7 @@ def test_other_labels_of_a_bench_clip_are_known_by_its_name():
 @pytest.mark.parametrize(("preset", "number"), [("bench", 5), ("bench-ood", 22)])
 def test_benches_are_what_was_frozen(preset, number):
     world = make_world(number, preset)
-    presence = presence_of(world)
-    made = make_episode(world.num_frames, seed=1, key=world.key)
-    episode = dataclasses.replace(
-        made,
-        T_camera_from_world=world.T_camera_from_world,
-        fov_vh_rad=np.tile(np.asarray(world.fov_vh_rad, np.float32), (world.num_frames, 1)),
-        hand_state=world.hands.hand_state,
-        presence=presence,
-        presence_score=None,
-    )
+    episode = labels_of(world, None, Corruption())
     require_frozen(preset, number, episode)
     moved = world.T_camera_from_world.copy()
     moved[10, 0, 3] += 0.01
