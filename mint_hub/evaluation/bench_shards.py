@@ -43,11 +43,11 @@ class ShardsBenchmark(Benchmark):
 
     def clip(self, i: int) -> Clip:
         """Read clip ``i``."""
-        frames = None
+        episode, frames = self.reader[i], None
         if self._packed:
-            frames = PackedFrames(bytes(self.reader.member(i, VIDEO_MEMBER)))
+            frames = PackedFrames(bytes(self.reader.member(i, VIDEO_MEMBER)), episode)
         why = "" if frames else f"{self.title} has no packed video: see `mint-hub pack`"
-        return clip_of(self.reader[i], frames, self.source.mano_dir, why)
+        return clip_of(episode, frames, self.source.mano_dir, why)
 
 
 class LabelsBenchmark(Benchmark):
@@ -103,7 +103,7 @@ def synthetic_benchmark(source: Source, num_procs: int = 1) -> ShardsBenchmark:
             f"{len(benchmark)}: remove the folder to have them drawn again"
         )
     try:
-        for i in range(expected):
+        for i in range(len(benchmark)):
             require_frozen(source.name, i, benchmark.reader[i])
     except ValueError as error:
         raise BenchmarkError(

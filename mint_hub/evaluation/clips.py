@@ -5,6 +5,7 @@ words which benchmark it is, so that every process opens its own.
 """
 
 import hashlib
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from mint_hub.geometry.hand_model import HandModel
 from mint_hub.loaders.clips import PackedClip
 from mint_hub.loaders.schema import Episode
+from mint_hub.synth.undo_lens import lens_of, undo_lens
 
 Image = NDArray[np.uint8]
 Name = Literal["bench", "bench-ood", "hot3d", "arctic", "shards", "labels"]
@@ -88,19 +90,23 @@ class Frames(ABC):
 
 @dataclass(frozen=True, eq=False)
 class PackedFrames(Frames):
-    """The pictures of an mp4 in a shard."""
+    """The pictures of an mp4 in a shard, as the camera of its episode's labels would take them."""
 
     mp4: bytes
+    episode: Episode
 
     def images(self, start: int = 0) -> Iterator[Image]:
-        """Yield the decoded frames."""
+        """Yield the decoded frames; a synthetic clip's lens is undone."""
         with PackedClip(self.mp4) as clip:
             for at in range(start, clip.num_frames, 32):
-                yield from clip.images(at, min(32, clip.num_frames - at))
+                shown = clip.images(at, min(32, clip.num_frames - at))
+                yield from undo_lens(shown, self.episode)
 
     def stamp(self) -> str:
-        """Return the hash of the bytes."""
-        return hashlib.sha256(self.mp4).hexdigest()
+        """Return the hash of the bytes, and of the lens where there is one."""
+        lens = lens_of(self.episode)
+        bent = b"" if lens is None else json.dumps(lens.to_dict(), sort_keys=True).encode()
+        return hashlib.sha256(self.mp4 + bent).hexdigest()
 
 
 @dataclass(frozen=True, eq=False)

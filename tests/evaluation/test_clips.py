@@ -8,6 +8,9 @@ import pytest
 from mint_hub.evaluation.benchmarks import open_benchmark
 from mint_hub.evaluation.clips import PackedFrames, Source
 from mint_hub.evaluation.scoring import ClipScorer
+from mint_hub.geometry.lenses import OpenCVLens
+from mint_hub.loaders.clips import PackedClip, encode_clip
+from mint_hub.synth.undo_lens import undo_lens
 from tests.evaluation_data import noisy, save_all, true_episode
 
 
@@ -67,6 +70,22 @@ def test_truth_stamp_follows_truth_camera_and_hand_but_no_last_bit(source, truth
 
 def test_other_pictures_are_the_same_truth_but_another_prediction(source):
     clip = clip_of(source)
-    one, two = (replace(clip, frames=PackedFrames(data)) for data in (b"one", b"two"))
+    one, two = (replace(clip, frames=PackedFrames(data, clip.truth)) for data in (b"one", b"two"))
     assert one.truth_stamp() == two.truth_stamp() == clip.truth_stamp()
     assert len({one.stamp(), two.stamp(), clip.stamp()}) == 3
+
+
+def test_a_network_sees_a_lens_clip_as_its_labels_do(truth):
+    size = (96, 128)
+    lens = OpenCVLens(size, 90.0, 90.0, 63.5, 47.5, (-0.2, 0.05, 0.004, -0.003))
+    rng = np.random.default_rng(0)
+    mp4 = encode_clip(list(rng.integers(0, 255, (5, *size, 3), np.uint8)), crf=10)
+    bent = replace(truth[0], meta={**truth[0].meta, "synth": {"lens": lens.to_dict()}})
+    with PackedClip(mp4) as clip:
+        stored = clip.images()
+    seen = np.stack(list(PackedFrames(mp4, bent).images(1)))
+    np.testing.assert_array_equal(seen, undo_lens(stored, bent)[1:])
+    assert not np.array_equal(seen, stored[1:])
+    plain = PackedFrames(mp4, truth[0])
+    np.testing.assert_array_equal(np.stack(list(plain.images())), stored)
+    assert plain.stamp() != PackedFrames(mp4, bent).stamp()
