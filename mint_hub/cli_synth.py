@@ -24,6 +24,7 @@ def add_synth(commands: Any) -> None:
     add("--config", help="name of the config (default: synth-PRESET)")
     add("--split", choices=("train", "validation"), help="default: train; of benches: validation")
     add("--frames", type=int, help="frames of every clip (default: 150 to 240, drawn)")
+    add("--samples", type=int, default=4, help="a pixel: 0, 2 or 4; 0 is a third faster")
     add("--scale", type=float, default=1.0, help="factor on the size of pictures (default: 1)")
     add(
         "--lens",
@@ -60,6 +61,7 @@ def _synth(args: argparse.Namespace) -> int:
         split=args.split,
         num_frames=args.frames,
         scale=args.scale,
+        samples=args.samples,
         lens=args.lens,
         depth=args.depth,
         segmentation=args.segmentation,

@@ -25,6 +25,9 @@ from mint_hub.synth.world import World
 Pass = Literal["rgb", "depth", "segmentation", "flow"]
 PASSES: Final[tuple[Pass, ...]] = ("rgb", "depth", "segmentation", "flow")
 
+SAMPLES: Final = 4
+"""Samples a pixel, for smooth edges."""
+
 NEAR_M: Final = 0.01
 FAR_M: Final = 60.0
 SOFTNESS_M: Final = (0.008, 0.025, 0.06)
@@ -77,7 +80,7 @@ class Renderer:
         self,
         image_size_hw: tuple[int, int],
         *,
-        samples: int = 4,
+        samples: int = SAMPLES,
         shadow_size: int = 512,
         hand_model: HandModel | None = None,
     ) -> None:
