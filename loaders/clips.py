@@ -6,7 +6,7 @@ pictures give the same bytes with the same FFmpeg.
 >>> from mint_hub.assets import sample_clip
 >>> clip = encode_clip(sample_clip(), 1.0, 2.0, size_hw=64)
 >>> decode_window(clip, 10, 16).shape
-(16, 64, 84, 3)
+(16, 64, 86, 3)
 """
 
 import math

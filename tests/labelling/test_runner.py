@@ -166,7 +166,7 @@ from mint_hub.labelling.cascade import Cascade
 from mint_hub.labelling.label import label_videos
 from tests.labelling.fake_stages import Cut, Invent
 folder, out, log = map(Path, sys.argv[1:4])
-stages = [Cut(), Invent(Invent.Settings(log=str(log), sleep_s=0.05))]
+stages = [Cut(), Invent(Invent.Settings(log=str(log), sleep_s=0.15))]
 videos = {p.stem: p for p in sorted(folder.glob("*.mp4"))}
 try:
     label_videos(videos, out, Cascade(stages))

@@ -52,7 +52,8 @@ def test_pixels_and_labels_of_the_same_frames(truth):
     assert window.images.shape == (16, 144, 240, 3)
     assert window.episode.image_size_hw == (144, 240)
     np.testing.assert_array_equal(window.episode.hand_state, labels.hand_state)
-    scale = np.diag([240 / 384, 144 / 294, 1])
+    height, width = truth.image_size_hw
+    scale = np.diag([240 / width, 144 / height, 1])
     np.testing.assert_allclose(window.episode.K, scale @ labels.K, atol=1e-9)
     video = VideoAttachment(truth, sample_clip())
     error = [

@@ -22,7 +22,7 @@ from mint_hub.labelling.stages.sfm_camera import (
 from mint_hub.loaders.schema import Episode
 from mint_hub.synth.episodes import make_clip
 
-SEED, FRAMES, IMAGES = 3, 90, 25
+SEED, FRAMES, IMAGES = 11, 90, 25
 
 
 @pytest.mark.slow
