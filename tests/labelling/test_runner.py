@@ -240,7 +240,7 @@ def test_interrupted_and_resumed(tmp_path, videos):
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors.decode()
     before = calls(tmp_path)
-    label_videos(videos, out, cascade(tmp_path, sleep_s=0.05))
+    label_videos(videos, out, cascade(tmp_path, sleep_s=0.15))  # as in SCRIPT
     assert keys(out) == ALL
     assert len(calls(tmp_path)) <= len(ALL) + 1
     assert calls(tmp_path)[: len(before)] == before
