@@ -1,6 +1,7 @@
 """A small world by hand: a room's floor and wall, a table, some things, two hands."""
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from mint_hub.geometry import hand_state as hands
@@ -9,6 +10,7 @@ from mint_hub.geometry.rigid import rigid
 from mint_hub.geometry.rotations import rotvec_to_matrix
 from mint_hub.synth import meshes
 from mint_hub.synth.draw_hand import POSES
+from mint_hub.synth.render import Renderer
 from mint_hub.synth.world import Body, Hands, Light, Texture, World
 
 SIZE_HW = (120, 160)
@@ -18,6 +20,14 @@ CLOTH = Texture("fabric", (0.08, 0.12, 0.3), (0.3, 0.3, 0.4), 6, 5)
 SUN = Light((-0.7, -0.3, -1.0), (1.0, 0.95, 0.85), (0.36, 0.38, 0.42))
 
 Floats = NDArray[np.float64]
+
+
+def renderer_or_skip(image_size_hw: tuple[int, int]) -> Renderer:
+    """Open a renderer, or skip the test with the reason why there is none."""
+    try:
+        return Renderer(image_size_hw)
+    except (ImportError, RuntimeError) as error:
+        pytest.skip(str(error))
 
 
 def looking(eye: Floats, target: Floats) -> Floats:

@@ -25,6 +25,7 @@ from mint_hub.synth.presets import RESERVED_SEEDS, is_bench, seed_of
 from mint_hub.synth.render import Renderer
 from mint_hub.synth.scene import make_world
 from mint_hub.synth.world import World
+from tests.small_world import renderer_or_skip
 
 ASSETS = Path(mint_hub.assets.__file__).parent
 VIDEO, TRUTH, CORPUS = ASSETS / "sample.mp4", ASSETS / "sample.npz", ASSETS / "sample_corpus"
@@ -57,11 +58,7 @@ def world() -> World:
 
 @pytest.fixture(scope="module")
 def renderer() -> Iterator[Renderer]:
-    try:
-        made = Renderer(SIZE_HW)
-    except (ImportError, RuntimeError) as error:
-        pytest.skip(str(error))
-    with made:
+    with renderer_or_skip(SIZE_HW) as made:
         yield made
 
 

@@ -338,7 +338,7 @@ def press(table: Tabletop, arm: Arm, start: float) -> bool:
         arm.angles.moves.pop()  # the finger stays stretched between taps
         arm.angles.target = grasp.angles_deg.copy()
     item.used += 1
-    arm.angles.to(table.person.posture("relaxed", arm.side, abs(round(10 * time))), time, 0.4)
+    arm.angles.to(table.person.posture("relaxed", arm.side, time), time, 0.4)
     table.say(f"{arm.side} hand presses the {item.thing.name}", arm.side, start, time)
     return True
 

@@ -398,16 +398,7 @@ class _Maker:
         if multiprocessing.parent_process() is not None:
             # One of several: Mesa draws on this process's own core, without threads beside it.
             os.environ.setdefault("LP_NUM_THREADS", "0")
-        return make_clip(
-            seed,
-            self.preset,
-            self.num_frames,
-            scale=self.scale,
-            samples=self.samples,
-            lens=self.lens,
-            depth=self.depth,
-            segmentation=self.segmentation,
-        )
+        return make_clip(seed, **asdict(self))
 
 
 class _Clips:

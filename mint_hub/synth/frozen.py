@@ -20,11 +20,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mint_hub.assets import asset_path, read_asset
+from mint_hub.assets import asset_path
 from mint_hub.geometry import hand_state
 from mint_hub.geometry.rigid import inverse, transform_points
 from mint_hub.loaders.schema import Episode
-from mint_hub.synth.presets import BENCH_FILE, GENERATOR, REVISION, fingerprint
+from mint_hub.synth.presets import BENCH_FILE, GENERATOR, REVISION, bench_rows, fingerprint
 
 __all__ = ["FrozenClip", "frozen_clip", "frozen_clips", "require_frozen"]
 
@@ -70,11 +70,10 @@ def _length(points: NDArray[np.float64]) -> float:
 @cache
 def frozen_clips() -> Mapping[str, FrozenClip]:
     """Return the clips of both benches by name: ``{"bench/0": FrozenClip(...)}``."""
-    found: dict[str, FrozenClip] = {}
-    for line in read_asset(BENCH_FILE).decode().splitlines():
-        if line and not line.startswith("#"):
-            known, name, frames, camera, wrists = line.split()
-            found[name] = FrozenClip(known, int(frames), float(camera), float(wrists))
+    found = {
+        name: FrozenClip(known, int(frames), float(camera), float(wrists))
+        for known, name, frames, camera, wrists in bench_rows()
+    }
     return MappingProxyType(found)
 
 

@@ -62,8 +62,12 @@ class Person:
     dominant: Side
     habits: int = 0
 
-    def posture(self, name: str, side: Side, occasion: int = 0) -> Floats:
-        """Angles (21,) of a named posture as this person has it, another one each occasion."""
+    def posture(self, name: str, side: Side, time: float, again: int = 0) -> Floats:
+        """Angles (21,) of a named posture as this person has it, another one at another time.
+
+        ``time`` counts in tenths of a second; ``again`` tells several at one time apart.
+        """
+        occasion = abs(round(10 * time)) + again
         words = (self.habits, SIDES.index(side), sum(map(ord, name)), occasion)
         return varied(POSTURES[name], np.random.default_rng(words))
 

@@ -36,6 +36,7 @@ __all__ = [
     "REVISION",
     "Preset",
     "bench_fingerprints",
+    "bench_rows",
     "fingerprint",
     "fingerprint_of",
     "is_bench",
@@ -210,12 +211,16 @@ def fingerprint(episode: Episode) -> str:
     return fingerprint_of(float(episode.fov_vh_rad[0, 1]), shape)
 
 
+def bench_rows() -> list[list[str]]:
+    """Words of each line of the frozen list, see `frozen`: the fingerprint, the clip, and more."""
+    lines = read_asset(BENCH_FILE).decode().splitlines()
+    return [line.split() for line in lines if line and not line.startswith("#")]
+
+
 @cache
 def bench_fingerprints() -> Mapping[str, str]:
     """Frozen fingerprints of both benches, each with its clip: ``{"0123...": "bench/7"}``."""
-    lines = read_asset(BENCH_FILE).decode().splitlines()
-    pairs = [line.split() for line in lines if line and not line.startswith("#")]
-    return MappingProxyType({line[0]: line[1] for line in pairs})
+    return MappingProxyType({row[0]: row[1] for row in bench_rows()})
 
 
 def is_bench(episode: Episode) -> bool:

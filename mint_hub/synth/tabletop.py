@@ -207,7 +207,7 @@ class Tabletop:
             plans.append([(clear, start + 0.5 * opening, quick, np.zeros(3))])
         (step,) = self._safest(arm, track, plans, span.grasp.opened_deg)
         left = track.to(*step)
-        loose = self.person.posture("relaxed", arm.side, _tenths(left))
+        loose = self.person.posture("relaxed", arm.side, left)
         arm.angles.to(loose, left - 0.2, 0.5)
         span.item.free_at = left - 0.1
         arm.free_at = left - 0.12
@@ -357,11 +357,6 @@ class Tabletop:
         return wrists, angles
 
 
-def _tenths(time: float) -> int:
-    """A number for an occasion: tenths of a second."""
-    return abs(round(10 * time))
-
-
 def _idle_pose(
     person: Person,
     side: Side,
@@ -371,11 +366,10 @@ def _idle_pose(
     time: float,
 ) -> tuple[Floats, Floats]:
     """Angles and T_work_from_wrist of a hand that does nothing, not on top of a thing."""
-    occasion = _tenths(time)
-    loose = person.posture("relaxed", side, occasion + 100)
+    loose = person.posture("relaxed", side, time, again=100)
     if where == "lap":
         return loose, person.lap(side, rng)
-    angles = person.posture(where, side, occasion)
+    angles = person.posture(where, side, time)
     soon = time + np.linspace(0.3, 4.0, 8)
     best, least = np.eye(4), np.inf
     for _ in range(12):

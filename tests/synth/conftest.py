@@ -5,14 +5,10 @@ from collections.abc import Iterator
 import pytest
 
 from mint_hub.synth.render import Renderer
-from tests.small_world import SIZE_HW
+from tests.small_world import SIZE_HW, renderer_or_skip
 
 
 @pytest.fixture(scope="session")
 def renderer() -> Iterator[Renderer]:
-    try:
-        made = Renderer(SIZE_HW)
-    except (ImportError, RuntimeError) as error:
-        pytest.skip(str(error))
-    with made:
+    with renderer_or_skip(SIZE_HW) as made:
         yield made
