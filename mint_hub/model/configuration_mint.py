@@ -14,6 +14,9 @@ class MintConfig(PreTrainedConfig):
     Args:
         image_size: (height, width) of a frame as the network sees it, multiples of patch_size.
         patch_size: side of a square patch, pixels.
+        patch_stem: how a patch becomes a token: "linear", as in the release, or "convolutional":
+            a 3 x 3 convolution for every halving of the picture (Xiao et al. 2021), which learns
+            sooner where little was learned before; patch_size must be a power of 2 then.
         position_grid: side, in patches, of the square grid of the position embedding.
         hidden_size: width C of the patch encoder and of the aggregator.
         num_attention_heads: heads in the encoder, frame and global layers.
@@ -47,6 +50,7 @@ class MintConfig(PreTrainedConfig):
 
     image_size: list[int] | tuple[int, int] = (378, 518)
     patch_size: int = 14
+    patch_stem: Literal["linear", "convolutional"] = "linear"
     position_grid: int = 37
     hidden_size: int = 1024
     num_attention_heads: int = 16
@@ -94,6 +98,13 @@ class MintConfig(PreTrainedConfig):
                     f"image_size: expected a {name} that is a positive multiple of "
                     f"patch_size={self.patch_size}, got {side}"
                 )
+        if self.patch_stem == "convolutional" and (
+            self.patch_size < 2 or self.patch_size & (self.patch_size - 1)
+        ):
+            raise ValueError(
+                "patch_size: expected a power of 2, at least 2, under a convolutional patch_stem, "
+                f"got {self.patch_size}"
+            )
         for width, heads, factor in (
             ("hidden_size", "num_attention_heads", 4),
             ("fov_hidden_size", "fov_heads", 1),

@@ -131,6 +131,35 @@ class MintCrossAttention(nn.Module):
         return self.out(output)
 
 
+class MintConvolutionalStem(nn.Sequential):
+    """(F, 3, H, W) -> (F, C, H / patch, W / patch): 3 x 3 convolutions that halve the picture.
+
+    All but the last are followed by LayerNorm over channels and GELU; widths double up to C.
+    """
+
+    def __init__(self, width: int, patch: int):
+        halvings = patch.bit_length() - 1
+        widths = [3, *(max(width >> left, 1) for left in reversed(range(halvings)))]
+        layers: list[nn.Module] = []
+        for i in range(halvings):
+            layers.append(nn.Conv2d(widths[i], widths[i + 1], 3, stride=2, padding=1))
+            if i + 1 < halvings:
+                layers += [MintChannelNorm(widths[i + 1], eps=1e-6), nn.GELU()]
+        super().__init__(*layers)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Keep the channels of a pixel beside each other in memory, as the norms need them."""
+        return super().forward(images.contiguous(memory_format=torch.channels_last))
+
+
+class MintChannelNorm(nn.LayerNorm):
+    """LayerNorm over the channels of each pixel, (F, C, h, w) -> (F, C, h, w)."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Normalise with channels last."""
+        return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+
 def small_attention(implementation: str) -> str:
     """Which implementation the heads use: eager where asked for, else SDPA.
 

@@ -445,6 +445,17 @@ WORLD = {
 """Weights of the paper's fourth objective; the paper gives none, these are ours."""
 
 
+MOTION = {
+    "camera/trans_l1": 0.25,
+    "camera/trans_vel_l1": 0.25,
+    "camera/rot_geo": 5.0,
+    "camera/rot_vel_geo": 10.0,
+}
+"""Camera weights, in place of the release's, for a network that must first learn to see motion: a
+camera turns by hundredths of a radian from frame to frame, so that its terms are a hundredth of the
+hands' otherwise. Ours."""
+
+
 def total(case: LossCase) -> tuple[Tensor, dict[str, Tensor]]:
     """The weighted sum of the case's terms, and each term with a weight above 0, unweighted.
 

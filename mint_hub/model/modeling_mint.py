@@ -39,6 +39,7 @@ from .heads_mint import (
 from .layers_mint import (
     MintAggregatorLayer,
     MintAttention,
+    MintConvolutionalStem,
     MintEncoderLayer,
     MintFrameLayer,
     MintGlobalLayer,
@@ -92,7 +93,11 @@ class MintEncoder(nn.Module):
         super().__init__()
         width, patch = config.hidden_size, config.patch_size
         self.grid = config.position_grid
-        self.patch_embedding = nn.Conv2d(3, width, patch, stride=patch)
+        self.patch_embedding = (
+            nn.Conv2d(3, width, patch, stride=patch)
+            if config.patch_stem == "linear"
+            else MintConvolutionalStem(width, patch)
+        )
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.register_tokens = nn.Parameter(torch.zeros(1, config.num_register_tokens, width))
         self.position_embeddings = nn.Parameter(torch.zeros(1, 1 + self.grid**2, width))
@@ -128,7 +133,7 @@ class MintEncoder(nn.Module):
             for values in (IMAGE_MEAN, IMAGE_STD)
         )
         images = (frames - mean) / std
-        patches = self.patch_embedding(images.to(self.patch_embedding.weight.dtype))  # (F, C, h, w)
+        patches = self.patch_embedding(images.to(self.cls_token.dtype))  # (F, C, h, w)
         cls_position, patch_positions = self.positions(tuple(patches.shape[-2:]))
         x = patches.flatten(2).transpose(1, 2) + patch_positions
         count = x.shape[0]

@@ -36,7 +36,7 @@ from mint_hub.training.normalisation import CameraScales, CameraSums, reanchored
 from mint_hub.training.order import MixtureOrder, group_weights
 from mint_hub.training.pixels import PixelCache, filter_of, resized
 from mint_hub.training.recipes import Presence
-from mint_hub.training.views import OVERSIZE, ViewAugmentation
+from mint_hub.training.views import OVERSIZE, Pace, View, ViewAugmentation
 from mint_hub.windows import WINDOW_LENGTH
 
 if TYPE_CHECKING:
@@ -172,12 +172,15 @@ class TrainingWindows:
         weights = group_weights(self.sources, self.settings.mixture)
         return MixtureOrder(self.sizes, weights, self.settings.seed)
 
-    def labels(self, number: int) -> Episode:
-        """Return the frames' record of a window, without pictures."""
-        split, i, start = (int(n) for n in self.places[number])
-        return self.splits[split].episode(i).window(start, self.settings.length)
+    def labels(self, number: int, span: int | None = None) -> Episode:
+        """Return the frames' record of a window, without pictures.
 
-    def pictures(self, number: int) -> NDArray[np.uint8]:
+        With ``span`` of that many frames: a stretch that holds the window, all in one episode.
+        """
+        split, i, start, length = self._stretch(number, span)
+        return self.splits[split].episode(i).window(start, length)
+
+    def pictures(self, number: int, span: int | None = None) -> NDArray[np.uint8]:
         """Decode the pictures of a window, (T, H, W, 3) uint8 RGB, in the geometry of its labels.
 
         Raises:
@@ -185,26 +188,35 @@ class TrainingWindows:
             ValueError: pictures of another size than their lens's.
 
         """
-        at, i, start = (int(n) for n in self.places[number])
-        split, length = self.splits[at], self.settings.length
+        at, i, start, length = self._stretch(number, span)
+        split = self.splits[at]
         if not split.packed:
             assert self.settings.videos is not None
             video = VideoAttachment(split.reader[i], self.settings.videos)
             return video.window(start, length).images
         return undo_lens(packed_images(split.reader, i, start, length), split.episode(i))
 
-    def resized(self, number: int, size_hw: tuple[int, int]) -> NDArray[np.uint8]:
+    def resized(
+        self, number: int, size_hw: tuple[int, int], span: int | None = None
+    ) -> NDArray[np.uint8]:
         """Return the pictures of a window at a size, (T, h, w, 3), kept ones where there are any.
 
         Raises:
             VideoError: as `pictures`.
 
         """
-        at, i, start = (int(n) for n in self.places[number])
+        at, i, start, length = self._stretch(number, span)
         cache = self.caches.get(at)
         if cache is not None and cache.size_hw == size_hw:
-            return cache.read(i, start, self.settings.length)
-        return resized(self.pictures(number), self.processor, size_hw)
+            return cache.read(i, start, length)
+        return resized(self.pictures(number, span), self.processor, size_hw)
+
+    def _stretch(self, number: int, span: int | None) -> tuple[int, int, int, int]:
+        """Number of the split and of its episode, first frame, frames."""
+        at, i, start = (int(n) for n in self.places[number])
+        length = self.settings.length if span is None else span
+        last = int(self.splits[at].reader.num_frames[i]) - length
+        return at, i, min(start, last), length
 
     def example(
         self,
@@ -217,11 +229,11 @@ class TrainingWindows:
 
         Augmentation follows from the settings' seed and ``position`` alone.
         """
-        episode, size_hw = self.labels(number), self.image_size_hw
-        images = self.resized(number, self.read_size_hw(views is not None))
-        if views is not None:
-            view = views(np.random.default_rng([self.settings.seed, _VIEW, position]))
-            images, episode = view.images(images, size_hw), view.episode(episode)
+        if views is None:
+            episode, images = self.labels(number), self.resized(number, self.image_size_hw)
+        else:
+            rng = np.random.default_rng([self.settings.seed, _VIEW, position])
+            episode, images = self._seen(number, views(rng), views.pace(rng))
         pixels = self.processor.video_processor.preprocess_frames(images)
         if augment is not None:
             pixels = augment(
@@ -229,6 +241,17 @@ class TrainingWindows:
             )
         labels = labels_of(episode, self.settings.presence, self.scales)
         return {"pixel_values": pixels, "labels": labels}
+
+    def _seen(self, number: int, view: View, pace: Pace) -> tuple[Episode, NDArray[np.uint8]]:
+        """A window by another camera and pace; at its own step where the episode is too short."""
+        at, i, *_ = self._stretch(number, None)
+        span = pace.span(self.settings.length)
+        if span > self.splits[at].reader.num_frames[i]:
+            pace, span = replace(pace, step=1), self.settings.length
+        episode = pace.episode(self.labels(number, span))
+        images = pace.frames(self.resized(number, self.read_size_hw(True), span))
+        images = view.images(images, episode.fov_vh_rad, self.image_size_hw)
+        return view.episode(episode), images
 
     @property
     def image_size_hw(self) -> tuple[int, int]:

@@ -17,6 +17,7 @@ from types import MappingProxyType
 from typing import Final, Literal
 
 from mint_hub.model.losses_mint import (
+    MOTION,
     RELEASE_STAGE_1,
     RELEASE_STAGE_2,
     WORLD,
@@ -102,7 +103,7 @@ class Recipe:
         init: what the run must begin with: "random", "pretrained", or None for either.
         sources: "one" refuses data of several sources.
         augment: change the colours of windows at random.
-        views: mirror windows and crop them about their middle at random, labels alike.
+        views: mirror, crop, turn, hasten and reverse windows at random, labels alike.
 
     Raises:
         ValueError: a number out of range, an unknown part, or nothing to train.
@@ -196,14 +197,18 @@ def _without(group: str) -> Callable[[Recipe], Recipe]:
     return lambda given: replace(given, loss=given.loss.without(group))
 
 
-def _with_world(given: Recipe) -> Recipe:
-    weights = MappingProxyType({**given.loss.weights, **WORLD})
-    return replace(given, loss=replace(given.loss, weights=weights))
+def _with(weights: Mapping[str, float]) -> Callable[[Recipe], Recipe]:
+    def weighted(given: Recipe) -> Recipe:
+        made = MappingProxyType({**given.loss.weights, **weights})
+        return replace(given, loss=replace(given.loss, weights=made))
+
+    return weighted
 
 
 OPTIONS: Final[Mapping[str, Callable[[Recipe], Recipe]]] = MappingProxyType(
     {
-        "world": _with_world,
+        "world": _with(WORLD),
+        "motion": _with(MOTION),
         "no-world": _without("world"),
         "no-image": _without("image"),
         "random": lambda given: replace(given, init="random"),
@@ -217,8 +222,9 @@ OPTIONS: Final[Mapping[str, Callable[[Recipe], Recipe]]] = MappingProxyType(
     }
 )
 """What may follow a base, each after a ``+``: world and no-world (the paper's fourth objective),
-no-image, random and pretrained (what to begin with), one-source, visible (presence learns the
-visible share of a hand), augment (colours), views (mirrored and cropped windows), scratch (random,
+motion (camera terms weigh as much as the hands': see `losses_mint.MOTION`), no-image, random and
+pretrained (what to begin with), one-source, visible (presence learns the visible share of a hand),
+augment (colours), views (windows mirrored, cropped, turned, faster, backwards), scratch (random,
 and one learning rate for all parts: nothing is known yet that a lower one would keep), fp32 (no
 autocast)."""
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from mint_hub.model.losses_mint import WORLD
+from mint_hub.model.losses_mint import MOTION, WORLD
 from mint_hub.training.recipes import (
     OPTIONS,
     PARTS,
@@ -41,6 +41,14 @@ def test_the_paper_adds_the_world_and_observability():
     made = paper_stage1()
     assert made.loss.observability
     assert {n: made.loss.weights[n] for n in WORLD} == WORLD
+
+
+def test_motion_weighs_the_camera_and_nothing_else():
+    before, after = recipe_named("stage1").loss.weights, recipe_named("stage1+motion").loss.weights
+    assert {n: after[n] for n in MOTION} == MOTION
+    assert {n: w for n, w in after.items() if n not in MOTION} == {
+        n: w for n, w in before.items() if n not in MOTION
+    }
 
 
 @pytest.mark.parametrize(

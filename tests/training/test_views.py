@@ -1,4 +1,4 @@
-"""Mirrored and cropped windows: labels stay exact, pictures are those of the other camera."""
+"""Windows mirrored, cropped, turned, timed: labels stay exact, as are pictures."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import pytest
 
 from mint_hub.geometry.camera import project
 from mint_hub.geometry.hand_model import HandModel
-from mint_hub.training.views import View, ViewAugmentation
+from mint_hub.training.views import Pace, View, ViewAugmentation
 from tests.training.corpus import training_episode
 
 HAND = HandModel.template()
@@ -48,7 +48,20 @@ def test_a_mirrored_camera_sees_the_mirrored_world():
         assert np.linalg.det(new[:3, :3]) == pytest.approx(1)
 
 
-@pytest.mark.parametrize("view", [View(), View(True), View(False, 0.7), View(True, 0.8)])
+TURN = (0.08, -0.06, 0.15)
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        View(),
+        View(True),
+        View(zoom=0.7),
+        View(True, 0.8),
+        View(turn_rad=TURN),
+        View(True, 0.8, TURN),
+    ],
+)
 def test_a_point_of_the_scene_is_where_the_labels_project_it(view):
     """A spot that is drawn at a projected point is found, in the new picture, where it should."""
     before = episode()
@@ -59,13 +72,43 @@ def test_a_point_of_the_scene_is_where_the_labels_project_it(view):
         uv, _ = project(point, before.K[0])
         spot = 255 * np.exp(-((u - uv[0]) ** 2 + (v - uv[1]) ** 2) / 8)
         image = np.repeat(spot[..., None], 3, -1).astype(np.uint8)
-        seen = view.images(image[None], (40, 50))[0, ..., 0].astype(float)
+        seen = view.images(image[None], before.fov_vh_rad[:1], (40, 50))[0, ..., 0].astype(float)
         rows, columns = np.mgrid[:40, :50] + 0.5
         found = np.array([(columns * seen).sum(), (rows * seen).sum()]) / seen.sum()
         after = replace(view.episode(before), image_size_hw=(40, 50))
         moved = point @ MIRROR if view.mirror else point
-        expected, _ = project(moved, after.K[0])
+        expected, _ = project(moved @ view.turn.T, after.K[0])
         np.testing.assert_allclose(found, expected, atol=0.1)
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_a_turned_camera_sees_the_same_world_from_the_same_place(mirror):
+    before, view = View(mirror=mirror).episode(episode()), View(mirror, turn_rad=TURN)
+    after = view.episode(episode())
+    centres = [np.linalg.inv(e.T_camera_from_world)[:, :3, 3] for e in (before, after)]
+    np.testing.assert_allclose(centres[1], centres[0], atol=1e-9)
+    world = [e.joints_world(HAND) for e in (before, after)]
+    there = after.presence
+    assert there.any()
+    np.testing.assert_allclose(world[1][there], world[0][there], atol=1e-5)
+    assert not (after.presence & ~before.presence).any()
+    np.testing.assert_array_equal(after.fov_vh_rad, before.fov_vh_rad)
+
+
+def test_another_pace_takes_every_nth_frame_and_runs_back():
+    before = episode()
+    stretch = before.window(2, Pace(3).span(3))
+    forward, back = Pace(3).episode(stretch), Pace(3, backward=True).episode(stretch)
+    assert forward.num_frames == back.num_frames == 3
+    for name in ("T_camera_from_world", "hand_state", "presence", "fov_vh_rad", "filled"):
+        np.testing.assert_array_equal(getattr(forward, name), getattr(before, name)[2:9:3])
+        np.testing.assert_array_equal(getattr(back, name), getattr(before, name)[8:1:-3])
+    np.testing.assert_array_equal(back.timestamps_s, before.timestamps_s[2:9:3])
+    assert back.fps == pytest.approx(before.fps / 3)
+    images = np.arange(7)[:, None, None, None] * np.ones((1, 2, 2, 3), np.uint8)
+    assert Pace(3, True).frames(images)[:, 0, 0, 0].tolist() == [6, 3, 0]
+    with pytest.raises(ValueError, match="step: expected at least 1, got 0"):
+        Pace(0)
 
 
 def test_hands_outside_a_crop_are_not_present():
@@ -95,5 +138,12 @@ def test_views_are_drawn_as_said_and_bad_ones_refused():
     assert np.mean([v.mirror for v in drawn]) == pytest.approx(0.3, abs=0.06)
     assert np.mean([v.zoom == 1 for v in drawn]) == pytest.approx(0.5, abs=0.06)
     assert min(v.zoom for v in drawn) > 0.6
+    turns = np.degrees([v.turn_rad for v in drawn])
+    assert (np.abs(turns).max(0) <= [8.001, 8.001, 12.001]).all()
+    np.testing.assert_allclose(turns.std(0), [3.9, 3.9, 5.8], rtol=0.15)
+    paces = [ViewAugmentation(steps=3, backward=0.5).pace(rng) for _ in range(600)]
+    assert np.mean([p.step == 1 for p in paces]) == pytest.approx(0.5, abs=0.06)
+    assert {p.step for p in paces} == {1, 2, 3}
+    assert np.mean([p.backward for p in paces]) == pytest.approx(0.5, abs=0.06)
     with pytest.raises(ValueError, match="zoom: expected more than 0, at most 1, got 0"):
         View(zoom=0)
