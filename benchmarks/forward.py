@@ -22,11 +22,13 @@ from mint_hub.model.modeling_mint import MintModel
 from mint_hub.windows import windows
 
 LENGTH = 32
+RELEASE_STEM = {"image_size": (112, 140), "patch_size": 14, "patch_stem": "linear"}
+"""`plain_mint` is the release's network, which embeds patches so."""
 
 
 def make_model(dtype: torch.dtype) -> MintModel:
     torch.manual_seed(0)
-    model = MintModel(MintConfig.tiny()).eval()
+    model = MintModel(MintConfig.tiny(**RELEASE_STEM)).eval()
     cast_weights(model, dtype)
     return model
 
@@ -77,7 +79,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=152)
     parser.add_argument("--rounds", type=int, default=5)
     args = parser.parse_args()
-    height, width = MintConfig.tiny().image_size
+    height, width = MintConfig.tiny(**RELEASE_STEM).image_size
     frames = torch.rand(args.frames, 3, height, width, generator=torch.Generator().manual_seed(1))
     results = {}
     for dtype in (torch.float32, torch.bfloat16):
@@ -94,7 +96,7 @@ def main() -> None:
             }
             print(name, overlap, results[name][f"overlap_{overlap}"])
     settings = {
-        "config": "MintConfig.tiny()",
+        "config": "MintConfig.tiny(**RELEASE_STEM)",
         "image_size": [height, width],
         "window": LENGTH,
         "frames": args.frames,
