@@ -20,9 +20,9 @@ def add_train(commands: Any) -> None:
         help="train a network on corpora with pictures",
         description="Train on packed corpora, or on labels beside your videos. RECIPE is stage1, "
         "stage2, paper-stage1 or paper-stage2, then options such as +random, +one-source, +world, "
-        "+no-world, +motion, +visible, +augment, +views, +scratch. Interrupted, the same command "
-        "goes on from the newest checkpoint. Several GPUs: start it with torchrun or accelerate. "
-        "Clips that benchmarks score on are refused. Needs mint-hub[train].",
+        "+no-world, +motion, +visible, +augment, +views, +even, +scratch. Interrupted, the same "
+        "command goes on from the newest checkpoint. Several GPUs: start it with torchrun or "
+        "accelerate. Clips that benchmarks score on are refused. Needs mint-hub[train].",
     )
     add = parser.add_argument
     add("--recipe", required=True, help="stage1, stage2, or a name with +options")

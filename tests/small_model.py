@@ -7,6 +7,8 @@ from mint_hub.model.modeling_mint import MintModel
 
 SIZES = {
     "image_size": (28, 42),
+    "patch_size": 14,
+    "patch_stem": "linear",
     "position_grid": 3,
     "hidden_size": 32,
     "num_attention_heads": 2,
@@ -14,6 +16,8 @@ SIZES = {
     "aggregator_layers": 1,
     "camera_layers": 1,
     "camera_heads": 4,
+    "camera_output_scale": 1.0,
+    "initializer": "release",
     "fov_hidden_size": 16,
     "fov_heads": 2,
     "hand_hidden_size": 32,

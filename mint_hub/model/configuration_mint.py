@@ -26,6 +26,9 @@ class MintConfig(PreTrainedConfig):
         camera_layers: depth of the camera head's trunk, run once an iteration.
         camera_heads: attention heads of the camera head, which is 2 C wide.
         camera_iterations: refinement iterations of the camera head.
+        camera_output_scale: what the camera head's last layer is multiplied by. A camera moves by
+            millimetres a frame: below 1, steps of training are as fine, and its gradients do not
+            drown the hands' in what both share, where nothing was learned before.
         fov_hidden_size: width of the field-of-view head.
         fov_heads: attention heads of the field-of-view head.
         fov_layers: depth of the field-of-view head.
@@ -39,7 +42,12 @@ class MintConfig(PreTrainedConfig):
         shape_space: what the ten shape numbers mean, "mano" or "mint" (the licence-free hand).
         encoder_layer_scale: initial LayerScale of the patch encoder.
         aggregator_layer_scale: initial LayerScale of the aggregator and of the camera head.
-        initializer_range: standard deviation of freshly initialised linear weights.
+        initializer: how fresh weights are drawn: "release", every linear layer alike, as where most
+            of them are replaced by pretrained ones; or "scratch", for networks that begin from
+            nothing: layers keep the size of what goes through them (LeCun et al. 1998), positions
+            are visible from the start (sine and cosine, Vaswani et al. 2017), and heads start at
+            their mean answer, so that fitting it does not wash out the features.
+        initializer_range: standard deviation of fresh linear weights under "release".
 
     Raises:
         ValueError: (when made) a size that does not divide what it must, naming the field.
@@ -60,6 +68,7 @@ class MintConfig(PreTrainedConfig):
     camera_layers: int = 4
     camera_heads: int = 16
     camera_iterations: int = 4
+    camera_output_scale: float = 1.0
     fov_hidden_size: int = 512
     fov_heads: int = 8
     fov_layers: int = 2
@@ -73,6 +82,7 @@ class MintConfig(PreTrainedConfig):
     shape_space: Literal["mano", "mint"] = "mano"
     encoder_layer_scale: float = 1.0
     aggregator_layer_scale: float = 0.01
+    initializer: Literal["release", "scratch"] = "release"
     initializer_range: float = 0.02
 
     def __post_init__(self, **kwargs: Any) -> None:
@@ -118,6 +128,10 @@ class MintConfig(PreTrainedConfig):
                     f"{width}: expected a multiple of {heads}={getattr(self, heads)}{extra}, "
                     f"got {getattr(self, width)}"
                 )
+        if not self.camera_output_scale > 0:
+            raise ValueError(
+                f"camera_output_scale: expected more than 0, got {self.camera_output_scale}"
+            )
         if self.camera_heads <= 0 or 2 * self.hidden_size % self.camera_heads:
             raise ValueError(
                 f"camera_heads: expected a divisor of 2 * hidden_size={2 * self.hidden_size}, "
@@ -156,7 +170,9 @@ class MintConfig(PreTrainedConfig):
     def tiny(cls, **overrides: Any) -> Self:
         """Sizes that run in real time on two CPU cores (for the default checkpoint)."""
         sizes: dict[str, Any] = {
-            "image_size": (112, 140),
+            "image_size": (128, 160),
+            "patch_size": 16,
+            "patch_stem": "convolutional",
             "position_grid": 10,
             "hidden_size": 192,
             "num_attention_heads": 3,
@@ -164,6 +180,7 @@ class MintConfig(PreTrainedConfig):
             "aggregator_layers": 4,
             "camera_layers": 2,
             "camera_heads": 6,
+            "camera_output_scale": 0.05,
             "fov_hidden_size": 128,
             "fov_heads": 4,
             "hand_hidden_size": 192,
@@ -171,6 +188,7 @@ class MintConfig(PreTrainedConfig):
             "presence_hidden_size": 96,
             "window": 16,
             "aggregator_layer_scale": 1.0,
+            "initializer": "scratch",
             "shape_space": "mint",
         }
         return cls(**(sizes | overrides))

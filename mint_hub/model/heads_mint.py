@@ -43,6 +43,7 @@ class MintCameraHead(nn.Module):
         super().__init__()
         width = 2 * config.hidden_size
         self.iterations = config.camera_iterations
+        self.output_scale = config.camera_output_scale
         self.token_norm = nn.LayerNorm(width)
         self.empty_pose = nn.Parameter(torch.zeros(1, 1, POSE_SIZE))
         self.embed_pose = nn.Linear(POSE_SIZE, width)
@@ -72,7 +73,7 @@ class MintCameraHead(nn.Module):
                 x = modulate(tokens, self.modulation(condition))
                 for layer in self.layers:
                     x = layer(x, implementation)
-                step = self.pose_mlp(self.layers_norm(x))
+                step = self.pose_mlp(self.layers_norm(x)) * self.output_scale
                 poses.append(poses[-1] + step if poses else step)
             return tuple(poses)
 

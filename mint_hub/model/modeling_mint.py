@@ -52,6 +52,9 @@ from .saving_mint import SavesCode
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
 IMAGE_STD = (0.229, 0.224, 0.225)
+SCRATCH_TOKEN_STD = 0.4
+SCRATCH_HEAD_STD = 4e-4
+"""Of fresh tokens and queries, and of the weights that make a head's numbers."""
 
 
 @dataclass
@@ -84,6 +87,14 @@ class MintOutput(ModelOutput):
     presence_logits: Tensor | None = None
     hidden_states: tuple[Tensor, ...] | None = None
     attentions: tuple[Tensor, ...] | None = None
+
+
+def sine_positions(grid: int, width: int) -> Tensor:
+    """Sines and cosines of the place on a square grid, (grid * grid, width), row by row."""
+    y, x = torch.meshgrid(*(torch.linspace(-1, 1, grid),) * 2, indexing="ij")
+    waves = math.pi / 2 * 2 ** torch.linspace(0, 3, width // 4)
+    parts = [f(side.reshape(-1, 1) * waves) for side in (x, y) for f in (torch.sin, torch.cos)]
+    return 0.5 * torch.cat(parts, 1)
 
 
 class MintEncoder(nn.Module):
@@ -238,13 +249,15 @@ class MintPreTrainedModel(SavesCode, PreTrainedModel):
 
     @torch.no_grad()
     def _init_weights(self, module: nn.Module) -> None:
-        std = self.config.initializer_range
+        scratch = self.config.initializer == "scratch"
+        std = SCRATCH_TOKEN_STD if scratch else self.config.initializer_range
         if isinstance(module, MintFovOutput):
-            init.normal_(module.weight, std=0.02)
+            init.normal_(module.weight, std=SCRATCH_HEAD_STD if scratch else 0.02)
             fov = torch.tensor([math.radians(degrees) for degrees in INITIAL_FOV_VH_DEG])
             init.copy_(module.bias, torch.log(torch.expm1(fov - 1e-4)))  # undo the softplus
         elif isinstance(module, nn.Linear | nn.Conv2d):
-            init.trunc_normal_(module.weight, std=std)
+            fan_in = module.weight[0].numel()
+            init.trunc_normal_(module.weight, std=fan_in**-0.5 if scratch else std)
             if module.bias is not None:
                 init.zeros_(module.bias)
         elif isinstance(module, nn.LayerNorm):
@@ -255,12 +268,16 @@ class MintPreTrainedModel(SavesCode, PreTrainedModel):
             init.constant_(module.layer_scale2, module.initial_layer_scale)
         elif isinstance(module, MintEncoder):
             for parameter in (module.cls_token, module.register_tokens):
-                init.normal_(parameter, std=1e-6)
+                init.normal_(parameter, std=std if scratch else 1e-6)
             init.trunc_normal_(module.position_embeddings, std=std)
+            if scratch:
+                patches = sine_positions(module.grid, module.position_embeddings.shape[-1])
+                cls = module.position_embeddings[:, :1]
+                init.copy_(module.position_embeddings, torch.cat([cls, patches[None]], 1))
             init.zeros_(module.mask_token)
         elif isinstance(module, MintAggregator):
             for parameter in (module.camera_token, module.register_token, module.scale_token):
-                init.normal_(parameter, std=1e-6)
+                init.normal_(parameter, std=std if scratch else 1e-6)
         else:
             self._init_head(module, std)
 
@@ -272,8 +289,11 @@ class MintPreTrainedModel(SavesCode, PreTrainedModel):
         """
         if isinstance(module, MintCameraHead):
             init.zeros_(module.empty_pose)
+            if self.config.initializer == "scratch":
+                init.normal_(module.pose_mlp.fc2.weight, std=SCRATCH_HEAD_STD)
             bias = torch.zeros(7)
-            bias[6] = 1.0 / module.iterations  # the iterations add up: w = 1
+            # The iterations add up to w = 1.
+            bias[6] = 1.0 / (module.iterations * module.output_scale)
             init.copy_(module.pose_mlp.fc2.bias, bias)
         elif isinstance(module, MintHandHead):
             init.normal_(module.queries, std=std)
@@ -282,11 +302,16 @@ class MintPreTrainedModel(SavesCode, PreTrainedModel):
             for name, joints in (("orientation", 1), ("pose", 15)):
                 init.copy_(module.absolute_heads[name].bias, identity.repeat(joints))
             init.copy_(module.absolute_heads["translation"].bias, torch.tensor(INITIAL_WRIST_M))
+            if self.config.initializer == "scratch":
+                for head in module.absolute_heads.values():
+                    init.normal_(head.weight, std=SCRATCH_HEAD_STD)
             for head in module.increment_heads.values():
                 init.zeros_(head.weight)
                 init.zeros_(head.bias)
         elif isinstance(module, MintPresenceHead):
             init.normal_(module.queries, std=std)
+            if self.config.initializer == "scratch":
+                init.normal_(module.classifier.weight, std=SCRATCH_HEAD_STD)
 
 
 class MintModel(MintPreTrainedModel):

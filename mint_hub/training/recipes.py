@@ -217,6 +217,7 @@ OPTIONS: Final[Mapping[str, Callable[[Recipe], Recipe]]] = MappingProxyType(
         "visible": lambda given: replace(given, presence="visible"),
         "augment": lambda given: replace(given, augment=True),
         "views": lambda given: replace(given, views=True),
+        "even": lambda given: replace(given, learning_rates=_RATES_SCRATCH),
         "scratch": lambda given: replace(given, init="random", learning_rates=_RATES_SCRATCH),
         "fp32": lambda given: replace(given, optimisation=replace(given.optimisation, bf16=False)),
     }
@@ -224,9 +225,9 @@ OPTIONS: Final[Mapping[str, Callable[[Recipe], Recipe]]] = MappingProxyType(
 """What may follow a base, each after a ``+``: world and no-world (the paper's fourth objective),
 motion (camera terms weigh as much as the hands': see `losses_mint.MOTION`), no-image, random and
 pretrained (what to begin with), one-source, visible (presence learns the visible share of a hand),
-augment (colours), views (windows mirrored, cropped, turned, faster, backwards), scratch (random,
-and one learning rate for all parts: nothing is known yet that a lower one would keep), fp32 (no
-autocast)."""
+augment (colours), views (windows mirrored, cropped, turned, faster, backwards), even (one learning
+rate for all parts, 5e-4), scratch (random and even: nothing is known yet that a lower rate would
+keep), fp32 (no autocast)."""
 
 
 def recipe_named(name: str) -> Recipe:

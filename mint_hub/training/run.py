@@ -152,7 +152,7 @@ def train(request: Request) -> Report:
     _check_windows(request, config, windows)
     facts = _facts(request, config, windows)
     with arguments.main_process_first(desc="run.json"):
-        _same_run(out, facts)
+        _same_run(out, facts, request.command)
         if arguments.process_index == 0:
             shutil.rmtree(out / STAGING, ignore_errors=True)
     done = out / MODEL
@@ -333,14 +333,14 @@ def _facts(request: Request, config: MintConfig, windows: TrainingWindows) -> di
     return json.loads(json.dumps(facts))
 
 
-def _same_run(out: Path, facts: dict[str, Any]) -> None:
-    """Write the record of a new run; refuse another run's folder."""
+def _same_run(out: Path, facts: dict[str, Any], command: str) -> None:
+    """Write the record of a new run, and what began it; refuse another run's folder."""
     path = out / RUN
     if not path.is_file():
         if last_checkpoint(out) is not None:
             raise ValueError(f"{out}: has checkpoints but no {RUN}: choose another folder")
         with replacing(path) as temporary:
-            temporary.write_text(json.dumps(facts, indent=1) + "\n")
+            temporary.write_text(json.dumps({**facts, "command": command}, indent=1) + "\n")
         return
     try:
         before = json.loads(path.read_text())

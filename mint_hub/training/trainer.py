@@ -21,7 +21,7 @@ from transformers.training_args import TrainingArguments
 from transformers.utils import logging as transformers_logging
 
 from mint_hub.loaders.atomic import replacing
-from mint_hub.model.layers_mint import MintLayer
+from mint_hub.model.layers_mint import MintConvolutionalStem, MintLayer
 from mint_hub.model.modeling_mint import MintModel
 from mint_hub.training.data import PositionDataset, TrainingWindows, collate
 from mint_hub.training.recipes import PARTS, Optimisation, Recipe
@@ -139,7 +139,7 @@ def training_arguments(
         dataloader_num_workers=pace.workers,
         dataloader_pin_memory=torch.cuda.is_available() and not cpu,
         ddp_find_unused_parameters=False,
-        use_cpu=cpu,
+        use_cpu=cpu or not torch.accelerator.is_available(),
         disable_tqdm=not progress,
         report_to="none",
         **more,
@@ -157,9 +157,9 @@ def prepare(model: MintModel, recipe: Recipe) -> None:
 
 
 def compile_layers(model: MintModel) -> None:
-    """Compile each transformer layer in place; scores during training run as they are."""
+    """Compile stem and transformer layers in place; scores during training run as they are."""
     for module in model.modules():
-        if isinstance(module, MintLayer):
+        if isinstance(module, MintLayer | MintConvolutionalStem):
             module.compile()
 
 
@@ -395,4 +395,6 @@ def make_optimizer(model: torch.nn.Module, recipe: Recipe) -> torch.optim.AdamW:
             if name.removeprefix("module.").startswith(f"{part}.") and parameter.requires_grad
         ]
         groups.append({"params": parameters, "lr": recipe.learning_rates[part], "name": part})
-    return torch.optim.AdamW(groups, betas=settings.betas, weight_decay=settings.weight_decay)
+    return torch.optim.AdamW(
+        groups, betas=settings.betas, weight_decay=settings.weight_decay, fused=True
+    )

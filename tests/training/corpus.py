@@ -22,6 +22,8 @@ def config() -> MintConfig:
     """One layer of everything at 28 x 42 pixels."""
     return MintConfig.tiny(
         image_size=(28, 42),
+        patch_size=14,
+        patch_stem="linear",
         position_grid=3,
         hidden_size=32,
         num_attention_heads=2,
@@ -29,6 +31,8 @@ def config() -> MintConfig:
         aggregator_layers=1,
         camera_layers=1,
         camera_heads=4,
+        camera_output_scale=1.0,
+        initializer="release",
         camera_iterations=2,
         fov_hidden_size=16,
         fov_heads=2,

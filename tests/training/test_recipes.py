@@ -74,6 +74,7 @@ def test_every_option_changes_a_stage_1_recipe():
     for option in OPTIONS:
         changed = recipe_named(f"paper-stage1+{option}")
         fields = ("loss", "init", "sources", "presence", "augment", "views", "optimisation")
+        fields += ("learning_rates",)
         same = all(getattr(changed, f) == getattr(base, f) for f in fields)
         assert same == (option == "world"), option  # the paper's has the world already
 

@@ -85,6 +85,12 @@ def test_a_run_leaves_a_network_that_loads(trained, corpus):
     ] == trained.log
 
 
+def test_without_a_gpu_a_run_goes_to_the_cpu_unasked(tmp_path):
+    arguments = training_arguments(tmp_path, small("stage1", batch=2), Pace(STEPS))
+    assert arguments.use_cpu == (not torch.accelerator.is_available())
+    assert training_arguments(tmp_path, small("stage1"), Pace(STEPS), cpu=True).use_cpu
+
+
 def test_the_log_has_terms_scores_and_frames(trained):
     lines = [line for line in trained.log if "loss" in line]
     assert {"hand/transl_l1", "camera/rot_geo", "image/reprojection"} <= set(lines[0])
