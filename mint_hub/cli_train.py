@@ -20,8 +20,8 @@ def add_train(commands: Any) -> None:
         help="train a network on corpora with pictures",
         description="Train on packed corpora, or on labels beside your videos. RECIPE is stage1, "
         "stage2, paper-stage1 or paper-stage2, then options such as +random, +one-source, +world, "
-        "+no-world, +motion, +visible, +augment, +views, +even, +scratch. Interrupted, the same "
-        "command goes on from the newest checkpoint. Several GPUs: start it with torchrun or "
+        "+no-world, +motion, +guide, +visible, +augment, +views, +even, +scratch. Interrupted, the "
+        "same command goes on from the newest checkpoint. Several GPUs: start it with torchrun or "
         "accelerate. Clips that benchmarks score on are refused. Needs mint-hub[train].",
     )
     add = parser.add_argument

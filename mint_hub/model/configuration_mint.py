@@ -17,6 +17,8 @@ class MintConfig(PreTrainedConfig):
         patch_stem: how a patch becomes a token: "linear", as in the release, or "convolutional":
             a 3 x 3 convolution for every halving of the picture (Xiao et al. 2021), which learns
             sooner where little was learned before; patch_size must be a power of 2 then.
+        patch_stem_blocks: residual blocks of two convolutions at each of the last two sizes of a
+            convolutional stem.
         position_grid: side, in patches, of the square grid of the position embedding.
         hidden_size: width C of the patch encoder and of the aggregator.
         num_attention_heads: heads in the encoder, frame and global layers.
@@ -59,6 +61,7 @@ class MintConfig(PreTrainedConfig):
     image_size: list[int] | tuple[int, int] = (378, 518)
     patch_size: int = 14
     patch_stem: Literal["linear", "convolutional"] = "linear"
+    patch_stem_blocks: int = 0
     position_grid: int = 37
     hidden_size: int = 1024
     num_attention_heads: int = 16
@@ -96,7 +99,7 @@ class MintConfig(PreTrainedConfig):
     def validate_architecture(self) -> None:
         """Check that sizes fit each other (called by transformers when a configuration is made)."""
         for name, value in self.to_dict().items():
-            least = 0 if name == "num_register_tokens" else 1
+            least = 0 if name in ("num_register_tokens", "patch_stem_blocks") else 1
             if name in self._counts() and value < least:
                 raise ValueError(f"{name}: expected at least {least}, got {value}")
         if len(self.image_size) != 2:
@@ -173,11 +176,12 @@ class MintConfig(PreTrainedConfig):
             "image_size": (128, 160),
             "patch_size": 16,
             "patch_stem": "convolutional",
+            "patch_stem_blocks": 2,
             "position_grid": 10,
             "hidden_size": 192,
             "num_attention_heads": 3,
-            "encoder_layers": 6,
-            "aggregator_layers": 4,
+            "encoder_layers": 2,
+            "aggregator_layers": 3,
             "camera_layers": 2,
             "camera_heads": 6,
             "camera_output_scale": 0.05,

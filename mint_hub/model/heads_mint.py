@@ -129,8 +129,13 @@ class MintHandHead(nn.Module):
             {name: nn.Linear(width, size) for name, (_, size) in HAND_PARTS.items()}
         )
 
-    def forward(self, tokens: Tensor, implementation: str) -> tuple[Tensor, ...]:
-        """(B, T, P, W) -> per iteration (B, T, 2, 109), camera frame, metres, left hand first."""
+    def forward(
+        self, tokens: Tensor, implementation: str, looks: list[Tensor] | None = None
+    ) -> tuple[Tensor, ...]:
+        """(B, T, P, W) -> per iteration (B, T, 2, 109), camera frame, metres, left hand first.
+
+        To ``looks``, where given, what each iteration attends to is added: (BT, 8, P).
+        """
         batch, frames = tokens.shape[:2]
         context = self.token_norm(self.token_proj(tokens.flatten(0, 1)))  # (BT, P, H)
         keys_values = self.cross_attention.project_context(context)
@@ -141,7 +146,7 @@ class MintHandHead(nn.Module):
             condition = nn.functional.silu(self.embed_state(seen.to(queries.dtype)))
             modulation = self.modulation(condition).repeat_interleave(len(HAND_PARTS), 1)
             x = modulate(queries, modulation)
-            x = x + self.cross_attention(x, keys_values, implementation)
+            x = x + self.cross_attention(x, keys_values, implementation, looks)
             for layer in self.layers:
                 x = layer(x, implementation)
             x = self.out_norm(x).unflatten(1, (2, len(HAND_PARTS)))  # (BT, 8, H) -> (BT, 2, 4, H)
@@ -185,11 +190,17 @@ class MintPresenceHead(nn.Module):
         self.out_norm = nn.LayerNorm(width)
         self.classifier = nn.Linear(width, 1)
 
-    def forward(self, patch_tokens: Tensor, implementation: str) -> Tensor:
-        """(B, T, N, W) -> (B, T, 2) logits, left hand first, float32."""
+    def forward(
+        self, patch_tokens: Tensor, implementation: str, looks: list[Tensor] | None = None
+    ) -> Tensor:
+        """(B, T, N, W) -> (B, T, 2) logits, left hand first, float32.
+
+        To ``looks``, where given, what it attends to is added: (BT, 2, N).
+        """
         batch, frames = patch_tokens.shape[:2]
         context = self.token_norm(self.token_proj(patch_tokens.flatten(0, 1)))
         queries = self.queries.expand(context.shape[0], -1, -1)
         keys_values = self.cross_attention.project_context(context)
-        x = self.out_norm(queries + self.cross_attention(queries, keys_values, implementation))
+        x = queries + self.cross_attention(queries, keys_values, implementation, looks)
+        x = self.out_norm(x)
         return self.classifier(x).squeeze(-1).float().unflatten(0, (batch, frames))

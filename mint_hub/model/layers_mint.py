@@ -122,27 +122,39 @@ class MintCrossAttention(nn.Module):
         key, value = pair.unflatten(-1, (2, self.num_heads, -1)).permute(2, 0, 3, 1, 4)
         return key, value
 
-    def forward(self, queries: Tensor, keys_values: tuple[Tensor, Tensor], implementation: str):
-        """(B, Lq, C) -> (B, Lq, C)."""
+    def forward(
+        self,
+        queries: Tensor,
+        keys_values: tuple[Tensor, Tensor],
+        implementation: str,
+        looks: list[Tensor] | None = None,
+    ):
+        """(B, Lq, C) -> (B, Lq, C); weights (B, Lq, Lk), mean of heads, are added to ``looks``."""
         width = queries.shape[-1]
         query = nn.functional.linear(queries, self.qkv.weight[:width], self.qkv.bias[:width])
         query = query.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)  # (B, h, Lq, d)
-        output, _ = attend(self, query, *keys_values, small_attention(implementation), False)
+        implementation = small_attention("eager" if looks is not None else implementation)
+        output, weights = attend(self, query, *keys_values, implementation, False)
+        if looks is not None:
+            looks.append(weights.float().mean(1))
         return self.out(output)
 
 
 class MintConvolutionalStem(nn.Sequential):
     """(F, 3, H, W) -> (F, C, H / patch, W / patch): 3 x 3 convolutions that halve the picture.
 
-    All but the last are followed by LayerNorm over channels and GELU; widths double up to C.
+    All but the last are followed by LayerNorm over channels and GELU; widths double up to C. The
+    last two sizes have ``blocks`` residual blocks each.
     """
 
-    def __init__(self, width: int, patch: int):
+    def __init__(self, width: int, patch: int, blocks: int = 0):
         halvings = patch.bit_length() - 1
         widths = [3, *(max(width >> left, 1) for left in reversed(range(halvings)))]
         layers: list[nn.Module] = []
         for i in range(halvings):
             layers.append(nn.Conv2d(widths[i], widths[i + 1], 3, stride=2, padding=1))
+            if i + 2 >= halvings:
+                layers += [MintConvolutionalBlock(widths[i + 1]) for _ in range(blocks)]
             if i + 1 < halvings:
                 layers += [MintChannelNorm(widths[i + 1], eps=1e-6), nn.GELU()]
         super().__init__(*layers)
@@ -150,6 +162,22 @@ class MintConvolutionalStem(nn.Sequential):
     def forward(self, images: Tensor) -> Tensor:
         """Keep the channels of a pixel beside each other in memory, as the norms need them."""
         return super().forward(images.contiguous(memory_format=torch.channels_last))
+
+
+class MintConvolutionalBlock(nn.Module):
+    """x + conv(gelu(norm(conv(gelu(norm x))))), (F, C, h, w) -> (F, C, h, w) (He et al. 2016)."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.norm1 = MintChannelNorm(width, eps=1e-6)
+        self.conv1 = nn.Conv2d(width, width, 3, padding=1)
+        self.norm2 = MintChannelNorm(width, eps=1e-6)
+        self.conv2 = nn.Conv2d(width, width, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Add the branch."""
+        branch = self.conv1(nn.functional.gelu(self.norm1(x)))
+        return x + self.conv2(nn.functional.gelu(self.norm2(branch)))
 
 
 class MintChannelNorm(nn.LayerNorm):

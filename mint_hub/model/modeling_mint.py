@@ -47,7 +47,7 @@ from .layers_mint import (
     rotary_positions,
 )
 from .loading_mint import load_checked
-from .losses_mint import RELEASE_STAGE_1, LossCase, LossSettings, total
+from .losses_mint import ATTENTION_TERM, RELEASE_STAGE_1, LossCase, LossSettings, total
 from .saving_mint import SavesCode
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
@@ -107,7 +107,7 @@ class MintEncoder(nn.Module):
         self.patch_embedding = (
             nn.Conv2d(3, width, patch, stride=patch)
             if config.patch_stem == "linear"
-            else MintConvolutionalStem(width, patch)
+            else MintConvolutionalStem(width, patch, config.patch_stem_blocks)
         )
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.register_tokens = nn.Parameter(torch.zeros(1, config.num_register_tokens, width))
@@ -418,9 +418,11 @@ class MintModel(MintPreTrainedModel):
         camera_tokens = tokens[:, :, 0]
         poses = self.camera_head(camera_tokens, implementation)
         fov = self.fov_head(camera_tokens, implementation)
-        hands = self.hand_head(tokens, implementation)
+        wanted = labels is not None and self.loss_settings.weights.get(ATTENTION_TERM, 0) > 0
+        looks: list[Tensor] | None = [] if wanted else None
+        hands = self.hand_head(tokens, implementation, looks)
         presence = self.presence_head(
-            tokens[:, :, self.config.num_special_tokens :], implementation
+            tokens[:, :, self.config.num_special_tokens :], implementation, looks
         )
         output = MintOutput(
             last_hidden_state=tokens,
@@ -431,18 +433,30 @@ class MintModel(MintPreTrainedModel):
             presence_logits=presence,
         )
         if labels is not None:
-            output.loss, output.losses = total(self._loss_case(output, labels, grid_hw))
+            case = self._loss_case(output, labels, grid_hw, looks)
+            output.loss, output.losses = total(case)
         return output
 
     def _loss_case(
-        self, output: MintOutput, labels: Mapping[str, Tensor], grid_hw: tuple[int, int]
+        self,
+        output: MintOutput,
+        labels: Mapping[str, Tensor],
+        grid_hw: tuple[int, int],
+        looks: list[Tensor] | None,
     ) -> LossCase:
         patch = self.config.patch_size
+        prediction = {n: output[n] for n in ("pose_encoding", "hand_state", "presence_logits")}
+        if looks is not None:  # (BT, 8 or 2, P or N) each -> (BT, 2, 4 or 1, N) -> (B, T, 2, Q, N)
+            count = grid_hw[0] * grid_hw[1]
+            looks = [look[..., -count:].unflatten(1, (2, -1)) for look in looks]
+            frames = output.presence_logits.shape[:2]
+            prediction["patch_attention"] = torch.cat(looks, 2).unflatten(0, frames)
         return LossCase(
-            {name: output[name] for name in ("pose_encoding", "hand_state", "presence_logits")},
+            prediction,
             labels,
             self.loss_settings,
             image_size_hw=(grid_hw[0] * patch, grid_hw[1] * patch),
+            grid_hw=grid_hw,
             shape_space=self.config.shape_space,
             hand_model=self.loss_hand_model,
         )

@@ -17,6 +17,7 @@ from types import MappingProxyType
 from typing import Final, Literal
 
 from mint_hub.model.losses_mint import (
+    GUIDE,
     MOTION,
     RELEASE_STAGE_1,
     RELEASE_STAGE_2,
@@ -209,6 +210,7 @@ OPTIONS: Final[Mapping[str, Callable[[Recipe], Recipe]]] = MappingProxyType(
     {
         "world": _with(WORLD),
         "motion": _with(MOTION),
+        "guide": _with(GUIDE),
         "no-world": _without("world"),
         "no-image": _without("image"),
         "random": lambda given: replace(given, init="random"),
@@ -223,11 +225,11 @@ OPTIONS: Final[Mapping[str, Callable[[Recipe], Recipe]]] = MappingProxyType(
     }
 )
 """What may follow a base, each after a ``+``: world and no-world (the paper's fourth objective),
-motion (camera terms weigh as much as the hands': see `losses_mint.MOTION`), no-image, random and
-pretrained (what to begin with), one-source, visible (presence learns the visible share of a hand),
-augment (colours), views (windows mirrored, cropped, turned, faster, backwards), even (one learning
-rate for all parts, 5e-4), scratch (random and even: nothing is known yet that a lower rate would
-keep), fp32 (no autocast)."""
+motion (camera terms weigh as much as the hands': see `losses_mint.MOTION`), guide (attention is
+drawn to the hands: see `losses_mint.GUIDE`), no-image, random and pretrained (what to begin with),
+one-source, visible (presence learns the visible share of a hand), augment (colours), views (windows
+mirrored, cropped, turned, faster, backwards), even (one learning rate for all parts, 5e-4), scratch
+(random and even: nothing is known yet that a lower rate would keep), fp32 (no autocast)."""
 
 
 def recipe_named(name: str) -> Recipe:

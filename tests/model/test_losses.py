@@ -11,6 +11,8 @@ from safetensors.torch import load_file
 from mint_hub.geometry.hand_model import HandModel
 from mint_hub.geometry.rotations import rotvec_to_matrix
 from mint_hub.model.losses_mint import (
+    ATTENTION_TERM,
+    GUIDE,
     RELEASE_STAGE_1,
     RELEASE_STAGE_2,
     TERMS,
@@ -24,8 +26,9 @@ from tests.model.losses import SIZE_HW, random_case
 from tests.small_model import small_model
 from tests.transformers_common.tiny import tiny_labels
 
-ALL = LossSettings(dict.fromkeys(TERMS, 1.0))
-HAND_TERMS = sorted(n for n in TERMS if n.split("/")[0] in ("hand", "world", "image"))
+OUTPUT_TERMS = [name for name in TERMS if name != ATTENTION_TERM]
+ALL = LossSettings(dict.fromkeys(OUTPUT_TERMS, 1.0))
+HAND_TERMS = sorted(n for n in OUTPUT_TERMS if n.split("/")[0] in ("hand", "world", "image"))
 
 
 @pytest.fixture(scope="module")
@@ -153,6 +156,55 @@ def test_image_term_counts_true_joints_on_screen_only():
     assert TERMS["image/reprojection"](case).item() == pytest.approx(0.0, abs=1e-9)
 
 
+def test_attention_term_by_hand():
+    """Attention spread evenly over 8 x 10 patches of 14 pixels, then all on patches with joints."""
+    case = replace(still_case(), grid_hw=(8, 10))
+    uv, _ = case.joints_on_screen
+    cells = (uv // 14).long()
+    numbers = cells[..., 1] * 10 + cells[..., 0]  # (B, T, 2, 21)
+    holds = torch.nn.functional.one_hot(numbers, 80).amax(-2).double()
+    even = torch.full((*holds.shape[:-1], 3, 80), 1 / 80, dtype=torch.float64)
+    case.prediction["patch_attention"] = even
+    expected = -(holds.sum(-1) / 80 + 1e-4).log().mean()
+    assert TERMS[ATTENTION_TERM](case).item() == pytest.approx(expected.item(), rel=1e-9)
+    first = torch.nn.functional.one_hot(numbers[..., 7], 80).double()
+    case.prediction["patch_attention"] = first[..., None, :].expand_as(even)
+    assert TERMS[ATTENTION_TERM](case).item() == pytest.approx(0.0, abs=2e-4)
+
+
+def test_attention_term_leaves_absent_hands_alone_and_asks_for_attention():
+    case = replace(still_case(), grid_hw=(8, 10))
+    with pytest.raises(ValueError, match="expected patch_attention in the prediction, got none"):
+        TERMS[ATTENTION_TERM](case)
+    given = torch.rand(*case.labels["presence"].shape, 2, 80, dtype=torch.float64)
+    case.labels["presence"][:, :, 1] = False
+    case.prediction["patch_attention"] = given.requires_grad_()
+    TERMS[ATTENTION_TERM](case).backward()
+    assert given.grad[:, :, 0].any()
+    assert not given.grad[:, :, 1].any()
+
+
+def test_a_network_gives_its_loss_what_it_attends_to():
+    model = small_model()
+    settings = model.loss_settings
+    model.loss_settings = replace(settings, weights={**settings.weights, **GUIDE})
+    seen = {}
+    plain = model._loss_case
+
+    def keep(*given):
+        seen["case"] = plain(*given)
+        return seen["case"]
+
+    model._loss_case = keep
+    output = model(torch.rand(2, 3, 3, 28, 42), labels=tiny_labels(2, 3))
+    given = seen["case"].prediction["patch_attention"]
+    assert given.shape == (2, 3, 2, 2 * 4 + 1, 6)  # two iterations of four queries, one of presence
+    assert (given.sum(-1) <= 1 + 1e-5).all()
+    torch.testing.assert_close(given[..., -1, :].sum(-1), torch.ones(2, 3, 2))
+    without = small_model()(torch.rand(2, 3, 3, 28, 42), labels=tiny_labels(2, 3))
+    assert set(output.losses) - set(without.losses) == {ATTENTION_TERM}
+
+
 def test_world_terms_by_hand():
     """A camera that stands 0.3 m further along x puts hands 0.3 m away; turned, they turn."""
     case = still_case()
@@ -184,7 +236,7 @@ def test_presence_learns_from_its_target():
 # --- gradients ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", sorted(TERMS))
+@pytest.mark.parametrize("name", sorted(OUTPUT_TERMS))
 @pytest.mark.parametrize("observability", [False, True])
 def test_gradients_are_those_of_the_values(name, observability):
     settings = LossSettings({name: 1.0}, observability=observability)
