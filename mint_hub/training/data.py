@@ -36,7 +36,7 @@ from mint_hub.training.normalisation import CameraScales, CameraSums, reanchored
 from mint_hub.training.order import MixtureOrder, group_weights
 from mint_hub.training.pixels import PixelCache, filter_of, resized
 from mint_hub.training.recipes import Presence
-from mint_hub.training.views import OVERSIZE, Pace, View, ViewAugmentation
+from mint_hub.training.views import OVERSIZE, Tempo, View, ViewAugmentation
 from mint_hub.windows import WINDOW_LENGTH
 
 if TYPE_CHECKING:
@@ -233,7 +233,7 @@ class TrainingWindows:
             episode, images = self.labels(number), self.resized(number, self.image_size_hw)
         else:
             rng = np.random.default_rng([self.settings.seed, _VIEW, position])
-            episode, images = self._seen(number, views(rng), views.pace(rng))
+            episode, images = self._seen(number, views(rng), views.tempo(rng))
         pixels = self.processor.video_processor.preprocess_frames(images)
         if augment is not None:
             pixels = augment(
@@ -242,14 +242,14 @@ class TrainingWindows:
         labels = labels_of(episode, self.settings.presence, self.scales)
         return {"pixel_values": pixels, "labels": labels}
 
-    def _seen(self, number: int, view: View, pace: Pace) -> tuple[Episode, NDArray[np.uint8]]:
-        """A window by another camera and pace; at its own step where the episode is too short."""
+    def _seen(self, number: int, view: View, tempo: Tempo) -> tuple[Episode, NDArray[np.uint8]]:
+        """A window by another camera and tempo; at its own step where the episode is too short."""
         at, i, *_ = self._stretch(number, None)
-        span = pace.span(self.settings.length)
+        span = tempo.span(self.settings.length)
         if span > self.splits[at].reader.num_frames[i]:
-            pace, span = replace(pace, step=1), self.settings.length
-        episode = pace.episode(self.labels(number, span))
-        images = pace.frames(self.resized(number, self.read_size_hw(True), span))
+            tempo, span = replace(tempo, step=1), self.settings.length
+        episode = tempo.episode(self.labels(number, span))
+        images = tempo.frames(self.resized(number, self.read_size_hw(True), span))
         images = view.images(images, episode.fov_vh_rad, self.image_size_hw)
         return view.episode(episode), images
 

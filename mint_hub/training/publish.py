@@ -58,7 +58,7 @@ def publish(
     model = MintModel.from_pretrained(runs[-1] / MODEL, dtype=torch.float32)
     torch.nn.Module.to(model, torch.bfloat16)
     tables = results_sections([read_results(path) for path in results]) if results else []
-    staging = out.with_name(f".{out.name}.partial")
+    staging, before = (out.with_name(f".{out.name}.{part}") for part in ("partial", "before"))
     shutil.rmtree(staging, ignore_errors=True)
     try:
         model.save_pretrained(staging)
@@ -70,8 +70,9 @@ def publish(
         if any("eval_loss" in line for line in log):
             (staging / CURVE).write_bytes(canvas.png_bytes(training_curve(log)))
         if out.exists():
-            shutil.rmtree(out)
+            out.rename(before)
         staging.rename(out)
+        shutil.rmtree(before, ignore_errors=True)
     finally:
         shutil.rmtree(staging, ignore_errors=True)
     return out

@@ -1,4 +1,4 @@
-"""A window seen by another camera, or at another pace: pictures and labels alike.
+"""A window seen by another camera, or at another tempo: pictures and labels alike.
 
 The labels stay exact. A mirrored scene has the left hand where the right one was; a crop about the
 middle is the picture of a camera with a smaller field of view at the same place; what a camera
@@ -26,7 +26,7 @@ from mint_hub.geometry.rotations import (
 from mint_hub.loaders.fields import PER_FRAME_META
 from mint_hub.loaders.schema import Episode
 
-__all__ = ["OVERSIZE", "Pace", "View", "ViewAugmentation"]
+__all__ = ["OVERSIZE", "Tempo", "View", "ViewAugmentation"]
 
 OVERSIZE: Final = 1.5
 """Pictures are kept this much larger than the network's, so that a crop of them is still sharp."""
@@ -122,7 +122,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Pace:
+class Tempo:
     """Which frames of a stretch make a window: every ``step``-th one, forwards or backwards."""
 
     step: int = 1
@@ -163,7 +163,7 @@ _PER_FRAME: Final = (
 
 @dataclass(frozen=True)
 class ViewAugmentation:
-    """Draws a view and a pace for every window.
+    """Draws a view and a tempo for every window.
 
     Attributes:
         mirror: share of windows that are mirrored.
@@ -190,36 +190,33 @@ class ViewAugmentation:
         x, y, z = (float(angle) for angle in turn)
         return View(bool(mirrored < self.mirror), zoom if narrowed < 0.5 else 1.0, (x, y, z))
 
-    def pace(self, rng: np.random.Generator) -> Pace:
-        """Draw a pace."""
+    def tempo(self, rng: np.random.Generator) -> Tempo:
+        """Draw a tempo."""
         slow, back = rng.random(2)
         step = int(rng.integers(2, self.steps + 1)) if self.steps > 1 and slow < 0.5 else 1
-        return Pace(step, bool(back < self.backward))
+        return Tempo(step, bool(back < self.backward))
 
 
 def _mirrored(state: NDArray[np.float32]) -> NDArray[np.float32]:
     """Exchange the hands (..., 2, 109) across x; joint rotations of a left hand already are."""
     hand = hands.unpack(np.asarray(state, np.float64)[..., ::-1, :])
     turned = mirror_rotations(rot6d_rows_to_matrix(hand.orientation_rot6d_rows))
-    made = HandState(
-        hand.translation @ _MIRROR,
-        matrix_to_rot6d_rows(turned),
-        hand.joint_rot6d_rows,
-        hand.shape_params,
-    )
-    return np.asarray(made.pack(), np.float32)
+    return _placed(hand, hand.translation @ _MIRROR, turned)
 
 
 def _turned(state: NDArray[Any], turn: NDArray[np.float64]) -> NDArray[np.float32]:
     """Hands (..., 2, 109) in the axes of a turned camera."""
     hand = hands.unpack(np.asarray(state, np.float64))
     turned = turn @ rot6d_rows_to_matrix(hand.orientation_rot6d_rows)
-    made = HandState(
-        hand.translation @ turn.T,
-        matrix_to_rot6d_rows(turned),
-        hand.joint_rot6d_rows,
-        hand.shape_params,
-    )
+    return _placed(hand, hand.translation @ turn.T, turned)
+
+
+def _placed(
+    hand: HandState, translation: NDArray[np.float64], orientation: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """A hand's posture and shape at another place, as a state."""
+    rot6d = matrix_to_rot6d_rows(orientation)
+    made = HandState(translation, rot6d, hand.joint_rot6d_rows, hand.shape_params)
     return np.asarray(made.pack(), np.float32)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from mint_hub.geometry.camera import project
 from mint_hub.geometry.hand_model import HandModel
-from mint_hub.training.views import Pace, View, ViewAugmentation
+from mint_hub.training.views import Tempo, View, ViewAugmentation
 from tests.training.corpus import training_episode
 
 HAND = HandModel.template()
@@ -95,10 +95,10 @@ def test_a_turned_camera_sees_the_same_world_from_the_same_place(mirror):
     np.testing.assert_array_equal(after.fov_vh_rad, before.fov_vh_rad)
 
 
-def test_another_pace_takes_every_nth_frame_and_runs_back():
+def test_another_tempo_takes_every_nth_frame_and_runs_back():
     before = episode()
-    stretch = before.window(2, Pace(3).span(3))
-    forward, back = Pace(3).episode(stretch), Pace(3, backward=True).episode(stretch)
+    stretch = before.window(2, Tempo(3).span(3))
+    forward, back = Tempo(3).episode(stretch), Tempo(3, backward=True).episode(stretch)
     assert forward.num_frames == back.num_frames == 3
     for name in ("T_camera_from_world", "hand_state", "presence", "fov_vh_rad", "filled"):
         np.testing.assert_array_equal(getattr(forward, name), getattr(before, name)[2:9:3])
@@ -106,9 +106,9 @@ def test_another_pace_takes_every_nth_frame_and_runs_back():
     np.testing.assert_array_equal(back.timestamps_s, before.timestamps_s[2:9:3])
     assert back.fps == pytest.approx(before.fps / 3)
     images = np.arange(7)[:, None, None, None] * np.ones((1, 2, 2, 3), np.uint8)
-    assert Pace(3, True).frames(images)[:, 0, 0, 0].tolist() == [6, 3, 0]
+    assert Tempo(3, True).frames(images)[:, 0, 0, 0].tolist() == [6, 3, 0]
     with pytest.raises(ValueError, match="step: expected at least 1, got 0"):
-        Pace(0)
+        Tempo(0)
 
 
 def test_hands_outside_a_crop_are_not_present():
@@ -141,9 +141,9 @@ def test_views_are_drawn_as_said_and_bad_ones_refused():
     turns = np.degrees([v.turn_rad for v in drawn])
     assert (np.abs(turns).max(0) <= [8.001, 8.001, 12.001]).all()
     np.testing.assert_allclose(turns.std(0), [3.9, 3.9, 5.8], rtol=0.15)
-    paces = [ViewAugmentation(steps=3, backward=0.5).pace(rng) for _ in range(600)]
-    assert np.mean([p.step == 1 for p in paces]) == pytest.approx(0.5, abs=0.06)
-    assert {p.step for p in paces} == {1, 2, 3}
-    assert np.mean([p.backward for p in paces]) == pytest.approx(0.5, abs=0.06)
+    tempi = [ViewAugmentation(steps=3, backward=0.5).tempo(rng) for _ in range(600)]
+    assert np.mean([p.step == 1 for p in tempi]) == pytest.approx(0.5, abs=0.06)
+    assert {p.step for p in tempi} == {1, 2, 3}
+    assert np.mean([p.backward for p in tempi]) == pytest.approx(0.5, abs=0.06)
     with pytest.raises(ValueError, match="zoom: expected more than 0, at most 1, got 0"):
         View(zoom=0)
