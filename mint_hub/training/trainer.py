@@ -395,6 +395,4 @@ def make_optimizer(model: torch.nn.Module, recipe: Recipe) -> torch.optim.AdamW:
             if name.removeprefix("module.").startswith(f"{part}.") and parameter.requires_grad
         ]
         groups.append({"params": parameters, "lr": recipe.learning_rates[part], "name": part})
-    return torch.optim.AdamW(
-        groups, betas=settings.betas, weight_decay=settings.weight_decay, fused=True
-    )
+    return torch.optim.AdamW(groups, betas=settings.betas, weight_decay=settings.weight_decay)

@@ -200,14 +200,14 @@ class ViewAugmentation:
 def _mirrored(state: NDArray[np.float32]) -> NDArray[np.float32]:
     """Exchange the hands (..., 2, 109) across x; joint rotations of a left hand already are."""
     hand = hands.unpack(np.asarray(state, np.float64)[..., ::-1, :])
-    turned = mirror_rotations(rot6d_rows_to_matrix(hand.orientation_rot6d_rows))
+    turned = np.asarray(mirror_rotations(rot6d_rows_to_matrix(hand.orientation_rot6d_rows)))
     return _placed(hand, hand.translation @ _MIRROR, turned)
 
 
 def _turned(state: NDArray[Any], turn: NDArray[np.float64]) -> NDArray[np.float32]:
     """Hands (..., 2, 109) in the axes of a turned camera."""
     hand = hands.unpack(np.asarray(state, np.float64))
-    turned = turn @ rot6d_rows_to_matrix(hand.orientation_rot6d_rows)
+    turned = turn @ np.asarray(rot6d_rows_to_matrix(hand.orientation_rot6d_rows))
     return _placed(hand, hand.translation @ turn.T, turned)
 
 

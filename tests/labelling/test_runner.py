@@ -183,6 +183,8 @@ def begin(videos, out, log):
         cwd=root,
         env={**os.environ, "PYTHONPATH": str(root)},
         stderr=subprocess.PIPE,
+        # Started in the background, a shell's children ignore interruptions, and so would this one.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
 
 

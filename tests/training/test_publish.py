@@ -11,7 +11,7 @@ from safetensors import safe_open
 from mint_hub.cards.sources import CardError
 from mint_hub.model.modeling_mint import MintModel
 from mint_hub.model.processing_mint import MintProcessor
-from mint_hub.training.curve import training_curve
+from mint_hub.training.curve import SHOWN, training_curve
 from mint_hub.training.publish import publish
 from mint_hub.training.recipes import recipe_named
 from mint_hub.training.run import Request, train
@@ -85,13 +85,23 @@ def test_the_record_of_all_runs(runs, folder):
     assert "mint-hub train --recipe stage2" in card
 
 
-def test_the_curve_has_a_panel_for_every_score(folder):
+def test_the_curve_comes_along(folder):
     image = cv2.imread(str(folder / "curve.png"))
+    assert image.shape[1] == 3 * 300
+
+
+def test_the_curve_has_a_panel_for_every_score():
+    lines = [
+        {"run": k // 2, "frames": 100 * k, **{f"eval_{name}": 5.0 - k for name in SHOWN}}
+        for k in range(4)
+    ]
+    image = training_curve(lines)
     assert image.shape == (3 * 190, 3 * 300, 3)
     for row in range(3):
         for column in range(3):
             panel = image[190 * row : 190 * (row + 1), 300 * column : 300 * (column + 1)]
             assert (panel.min(-1) < 200).mean() > 0.005  # something is drawn
+    assert training_curve([{"frames": 1, "eval_GO-p": 2.0}]).shape == (190, 900, 3)
     with pytest.raises(ValueError, match="expected lines with scores"):
         training_curve([{"loss": 1.0, "frames": 3}])
 
