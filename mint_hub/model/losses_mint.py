@@ -175,6 +175,15 @@ class LossCase:
         return self.present
 
     @cached_property
+    def hands(self) -> "Pair":
+        """(B, T, 2, 109)."""
+        # A hand that is not there holds anything, also NaN: it is replaced, not multiplied away.
+        there = self.present[..., None] > 0
+        truth = _real(self.labels["hand_state"])
+        truth = torch.where(there, truth, hand_state.absent(like=truth))
+        return Pair(_real(self.prediction["hand_state"]), truth)
+
+    @cached_property
     def wrist(self) -> "Pair":
         """(B, T, 2, 3) metres, camera frame."""
         return self._hand(lambda state: state.translation)
@@ -208,12 +217,8 @@ class LossCase:
     def joints(self) -> "Pair":
         """(B, T, 2, 21, 3) metres, camera frame; of absent true hands anything finite."""
         model = self.hand_model or default_hand(self.shape_space)
-        there = self.present[..., None] > 0
-        truth = _real(self.labels["hand_state"])
-        truth = torch.where(there, truth, hand_state.absent(like=truth))
         space: Any = self.shape_space
-        states = Pair(_real(self.prediction["hand_state"]), truth)
-        return states.over(lambda x: model.keypoints(x, shape_space=space, check=False))
+        return self.hands.over(lambda x: model.keypoints(x, shape_space=space, check=False))
 
     @cached_property
     def true_K(self) -> Tensor:  # noqa: N802
@@ -261,14 +266,7 @@ class LossCase:
         return Pair(part(_real(self.prediction[name])), part(_real(self.labels[name])))
 
     def _hand(self, part: Callable[[hand_state.HandState], Any]) -> "Pair":
-        def read(states: Tensor) -> Tensor:
-            return part(hand_state.unpack(states))
-
-        # A hand that is not there holds anything, also NaN: it is replaced, not multiplied away.
-        there = self.present[..., None] > 0
-        truth = _real(self.labels["hand_state"])
-        truth = torch.where(there, truth, hand_state.absent(like=truth))
-        return Pair(read(_real(self.prediction["hand_state"])), read(truth))
+        return self.hands.over(lambda states: part(hand_state.unpack(states)))
 
 
 class Pair(tuple[Tensor, Tensor]):

@@ -287,9 +287,10 @@ class MintPreTrainedModel(SavesCode, PreTrainedModel):
         Called after the head's linear layers were initialised (children come first), and only for
         modules that hold parameters of their own.
         """
+        scratch = self.config.initializer == "scratch"
         if isinstance(module, MintCameraHead):
             init.zeros_(module.empty_pose)
-            if self.config.initializer == "scratch":
+            if scratch:
                 init.normal_(module.pose_mlp.fc2.weight, std=SCRATCH_HEAD_STD)
             bias = torch.zeros(7)
             # The iterations add up to w = 1.
@@ -302,7 +303,7 @@ class MintPreTrainedModel(SavesCode, PreTrainedModel):
             for name, joints in (("orientation", 1), ("pose", 15)):
                 init.copy_(module.absolute_heads[name].bias, identity.repeat(joints))
             init.copy_(module.absolute_heads["translation"].bias, torch.tensor(INITIAL_WRIST_M))
-            if self.config.initializer == "scratch":
+            if scratch:
                 for head in module.absolute_heads.values():
                     init.normal_(head.weight, std=SCRATCH_HEAD_STD)
             for head in module.increment_heads.values():
@@ -310,7 +311,7 @@ class MintPreTrainedModel(SavesCode, PreTrainedModel):
                 init.zeros_(head.bias)
         elif isinstance(module, MintPresenceHead):
             init.normal_(module.queries, std=std)
-            if self.config.initializer == "scratch":
+            if scratch:
                 init.normal_(module.classifier.weight, std=SCRATCH_HEAD_STD)
 
 

@@ -4,8 +4,7 @@
 
 Runs come in the order they were trained, each begun with the one before. The folder holds weights
 in half precision, config.json, the processor, run.json (command, seed, data hash, settings of every
-run), log.jsonl (the lines of all runs, frames counted through), their curve, and a card. The
-embedded mint-tiny was made so.
+run), log.jsonl (the lines of all runs, frames counted through), their curve, and a card.
 """
 
 from __future__ import annotations
@@ -24,15 +23,13 @@ from mint_hub.cards.model import read_results, results_sections
 from mint_hub.model.modeling_mint import MintModel
 from mint_hub.model.processing_mint import MintProcessor
 from mint_hub.training.curve import training_curve
-from mint_hub.training.run import MODEL, RUN
+from mint_hub.training.run import CARD_HEAD, MODEL, RUN, first_line, read_log
 from mint_hub.training.trainer import LOG
 from mint_hub.view import canvas
 
 __all__ = ["publish"]
 
 CURVE: Final = "curve.png"
-SYNTHETIC: Final = "**Trained on synthetic clips only: for trying the API, not for labelling.**"
-OTHER: Final = "A checkpoint of a training run; evaluate it before use."
 
 
 def publish(
@@ -92,26 +89,24 @@ def _frames(records: Sequence[dict[str, Any]]) -> int:
 
 def _lines(run: Path, number: int, frames: int) -> list[dict[str, Any]]:
     """Lines of a run's log, with its number and frames counted from the first run on."""
-    lines = [json.loads(line) for line in (run / LOG).read_text().splitlines()]
-    return [{"run": number, **line, "frames": frames + line.get("frames", 0)} for line in lines]
+    return [
+        {"run": number, **line, "frames": frames + line.get("frames", 0)} for line in read_log(run)
+    ]
 
 
 def _card(
     model: MintModel, records: Sequence[dict[str, Any]], tables: Sequence[str], limits: str
 ) -> str:
-    synthetic = all("mint-hub synth" in name for r in records for name in r["sources"])
     size = sum(p.numel() for p in model.parameters()) / 1e6
     height, width = model.config.image_size
-    head = "---\nlibrary_name: transformers\ntags:\n- mint\n- egocentric\n- hands\n---\n"
     rows = "".join(
         f"| {k} | {r['recipe']} | {r['steps']} | {r['batch']} x {r['window']} | "
-        f"{r['steps'] * r['batch'] * r['window']:,} | {r['seed']} | {r['data']} |\n"
+        f"{_frames([r]):,} | {r['seed']} | {r['data']} |\n"
         for k, r in enumerate(records, 1)
     )
     commands = "\n".join(r.get("command") or "(the Python API)" for r in records)
     parts = [
-        head,
-        SYNTHETIC if synthetic else OTHER,
+        first_line(name for r in records for name in r["sources"]),
         f"{size:.1f} million parameters, frames of {height} x {width} pixels, windows of "
         f"{model.config.window} frames, bfloat16.",
         "## Runs\n\n| | recipe | steps | windows x frames | frames seen | seed | data |\n"
@@ -121,7 +116,7 @@ def _card(
     ]
     parts += ["## Scores\n\n" + "\n".join(tables).strip()] if tables else []
     parts += [f"## Limits\n\n{limits.strip()}"] if limits.strip() else []
-    return "\n\n".join(parts).replace("---\n\n\n", "---\n\n") + "\n"
+    return CARD_HEAD + "\n" + "\n\n".join(parts) + "\n"
 
 
 def main() -> None:

@@ -155,7 +155,7 @@ _RATES_1: Final[Mapping[Part, float]] = MappingProxyType(
         "presence_head": 5e-4,
     }
 )
-_RATES_SCRATCH: Final[Mapping[Part, float]] = MappingProxyType(dict.fromkeys(PARTS, 5e-4))
+_RATES_EVEN: Final[Mapping[Part, float]] = MappingProxyType(dict.fromkeys(PARTS, 5e-4))
 _RATES_2: Final[Mapping[Part, float]] = MappingProxyType({"camera_head": 5e-5})
 
 
@@ -219,8 +219,8 @@ OPTIONS: Final[Mapping[str, Callable[[Recipe], Recipe]]] = MappingProxyType(
         "visible": lambda given: replace(given, presence="visible"),
         "augment": lambda given: replace(given, augment=True),
         "views": lambda given: replace(given, views=True),
-        "even": lambda given: replace(given, learning_rates=_RATES_SCRATCH),
-        "scratch": lambda given: replace(given, init="random", learning_rates=_RATES_SCRATCH),
+        "even": lambda given: replace(given, learning_rates=_RATES_EVEN),
+        "scratch": lambda given: replace(given, init="random", learning_rates=_RATES_EVEN),
         "fp32": lambda given: replace(given, optimisation=replace(given.optimisation, bf16=False)),
     }
 )

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -41,11 +41,12 @@ from mint_hub.training.trainer import (
 )
 from mint_hub.training.views import ViewAugmentation
 
-__all__ = ["MODEL", "RUN", "Report", "Request", "train"]
+__all__ = ["CARD_HEAD", "MODEL", "RUN", "Report", "Request", "first_line", "read_log", "train"]
 
 RUN: Final = "run.json"
 MODEL: Final = "model"
 SURVEYS: Final = "surveys"
+CARD_HEAD: Final = "---\nlibrary_name: transformers\ntags:\n- mint\n- egocentric\n- hands\n---\n"
 
 
 @dataclass(frozen=True)
@@ -157,7 +158,7 @@ def train(request: Request) -> Report:
             shutil.rmtree(out / STAGING, ignore_errors=True)
     done = out / MODEL
     if done.is_dir() and checkpoint is not None and _step(checkpoint) >= request.pace.steps:
-        return Report(done, _step(checkpoint), _step(checkpoint), _log(out), windows.warnings)
+        return Report(done, _step(checkpoint), _step(checkpoint), read_log(out), windows.warnings)
     set_seed(request.recipe.optimisation.seed)
     model = MintModel(config) if checkpoint is not None else _model(request, config)
     model.set_attn_implementation(request.attention)
@@ -354,11 +355,19 @@ def _same_run(out: Path, facts: dict[str, Any], command: str) -> None:
             )
 
 
+def first_line(sources: Iterable[str]) -> str:
+    """Say on a card what a network trained on these sources is."""
+    if all("mint-hub synth" in name for name in sources):
+        return "Trained on synthetic clips only, for trying the API, not for labelling."
+    return "A checkpoint of a training run; evaluate it before use."
+
+
 def _step(checkpoint: Path) -> int:
     return int(checkpoint.name.rsplit("-", 1)[1])
 
 
-def _log(out: Path) -> list[dict[str, Any]]:
+def read_log(out: Path) -> list[dict[str, Any]]:
+    """Read the lines of a run's log; none where there is no log yet."""
     path = out / LOG
     return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
 
@@ -373,12 +382,6 @@ class _Card:
     def __call__(self, now: Mapping[str, Any]) -> str:
         facts = self.facts
         sources = ", ".join(f"{name or 'unnamed'} ({n})" for name, n in facts["sources"].items())
-        synthetic = all("mint-hub synth" in name for name in facts["sources"])
-        first = (
-            "Trained on synthetic clips only, for trying the API, not for labelling."
-            if synthetic
-            else "A checkpoint of a training run; evaluate it before use."
-        )
         rows = {
             "recipe": facts["recipe"],
             "begun with": facts["init"] if facts["init"] == "random" else "a checkpoint",
@@ -390,5 +393,4 @@ class _Card:
             "command": f"`{self.request.command}`" if self.request.command else "the Python API",
         }
         table = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
-        head = "---\nlibrary_name: transformers\ntags:\n- mint\n- egocentric\n- hands\n---\n"
-        return f"{head}\n{first}\n\n| | |\n| --- | --- |\n{table}\n"
+        return f"{CARD_HEAD}\n{first_line(facts['sources'])}\n\n| | |\n| --- | --- |\n{table}\n"
