@@ -6,6 +6,8 @@ from typing import Any, Literal, Self
 from huggingface_hub.dataclasses import strict
 from transformers.configuration_utils import PreTrainedConfig
 
+MAY_BE_ZERO = ("num_register_tokens", "patch_stem_blocks", "motion_radius")
+
 
 @strict
 class MintConfig(PreTrainedConfig):
@@ -25,9 +27,15 @@ class MintConfig(PreTrainedConfig):
         encoder_layers: depth of the patch encoder.
         aggregator_layers: pairs of one frame layer and one global layer.
         num_register_tokens: register tokens, in the encoder and again in the aggregator.
+        motion_radius: largest shift, in pixels at half size, at which patches are compared with the
+            frame before, as a cue of motion for small networks (`MintMotionCue`); 0, as in the
+            release: patches are not compared. Needs a patch_size that is a multiple of 4.
         camera_layers: depth of the camera head's trunk, run once an iteration.
         camera_heads: attention heads of the camera head, which is 2 C wide.
         camera_iterations: refinement iterations of the camera head.
+        camera_relative_to: what the camera head's numbers of a frame mean: its pose relative to the
+            window's "first" frame, as in the release, or its motion since the "previous" one, which
+            are chained into poses: small networks then need not add up a window's motion.
         camera_output_scale: what the camera head's last layer is multiplied by. A camera moves by
             millimetres a frame: below 1, steps of training are as fine, and its gradients do not
             drown the hands' in what both share, where nothing was learned before.
@@ -68,9 +76,11 @@ class MintConfig(PreTrainedConfig):
     encoder_layers: int = 24
     aggregator_layers: int = 24
     num_register_tokens: int = 4
+    motion_radius: int = 0
     camera_layers: int = 4
     camera_heads: int = 16
     camera_iterations: int = 4
+    camera_relative_to: Literal["first", "previous"] = "first"
     camera_output_scale: float = 1.0
     fov_hidden_size: int = 512
     fov_heads: int = 8
@@ -99,7 +109,7 @@ class MintConfig(PreTrainedConfig):
     def validate_architecture(self) -> None:
         """Check that sizes fit each other (called by transformers when a configuration is made)."""
         for name, value in self.to_dict().items():
-            least = 0 if name in ("num_register_tokens", "patch_stem_blocks") else 1
+            least = 0 if name in MAY_BE_ZERO else 1
             if name in self._counts() and value < least:
                 raise ValueError(f"{name}: expected at least {least}, got {value}")
         if len(self.image_size) != 2:
@@ -117,6 +127,10 @@ class MintConfig(PreTrainedConfig):
             raise ValueError(
                 "patch_size: expected a power of 2, at least 2, under a convolutional patch_stem, "
                 f"got {self.patch_size}"
+            )
+        if self.motion_radius and self.patch_size % 4:
+            raise ValueError(
+                f"patch_size: expected a multiple of 4 with a motion_radius, got {self.patch_size}"
             )
         for width, heads, factor in (
             ("hidden_size", "num_attention_heads", 4),
@@ -155,6 +169,11 @@ class MintConfig(PreTrainedConfig):
         return height // self.patch_size, width // self.patch_size
 
     @property
+    def token_size(self) -> int:
+        """Numbers of a patch token: its width, and what motion is seen by, if it is."""
+        return self.hidden_size + ((self.patch_size // 2) ** 2 if self.motion_radius else 0)
+
+    @property
     def num_special_tokens(self) -> int:
         """Tokens before a frame's patches: one camera, the registers, one scale."""
         return self.num_register_tokens + 2
@@ -182,8 +201,10 @@ class MintConfig(PreTrainedConfig):
             "num_attention_heads": 3,
             "encoder_layers": 2,
             "aggregator_layers": 3,
+            "motion_radius": 5,
             "camera_layers": 2,
             "camera_heads": 6,
+            "camera_relative_to": "previous",
             "camera_output_scale": 0.05,
             "fov_hidden_size": 128,
             "fov_heads": 4,

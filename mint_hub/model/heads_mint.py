@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from ..geometry import hand_state
 from ..geometry.hand_state import HAND_STATE_SIZE, HandState
-from ..geometry.rotations import rotvec_to_matrix
+from ..geometry.rotations import matrix_to_quat_xyzw, quat_xyzw_to_matrix, rotvec_to_matrix
 from .configuration_mint import MintConfig
 from .layers_mint import MintCrossAttention, MintLayer, MintMLP
 
@@ -36,6 +36,25 @@ def bounded_rotation(rotvec: Tensor) -> Tensor:
     return rotvec_to_matrix(rotvec * bound)
 
 
+def chained(motions: Tensor) -> Tensor:
+    """Poses (B, T, 7) relative to the first frame of motions (B, T, 7) since the frame before.
+
+    The first frame's motion is not used: it is where the window starts. T_k = D_k T_{k-1}, summed
+    up over strides 1, 2, 4, ... (Hillis and Steele 1986).
+    """
+    R, t = quat_xyzw_to_matrix(motions[..., 3:], check=False), motions[..., :3, None]
+    pose = torch.cat([R, t], -1)  # (B, T, 3, 4)
+    pose = torch.cat([torch.eye(3, 4).to(pose).expand_as(pose[:, :1]), pose[:, 1:]], 1)
+    stride, frames = 1, pose.shape[1]
+    while stride < frames:
+        before, after = pose[:, :-stride], pose[:, stride:]
+        moved = after[..., :3] @ before
+        moved = torch.cat([moved[..., :3], moved[..., 3:] + after[..., 3:]], -1)
+        pose = torch.cat([pose[:, :stride], moved], 1)
+        stride *= 2
+    return torch.cat([pose[..., 3], matrix_to_quat_xyzw(pose[..., :3])], -1)
+
+
 class MintCameraHead(nn.Module):
     """World-to-camera pose of each frame, refined over several iterations, causal in time, fp32."""
 
@@ -44,6 +63,7 @@ class MintCameraHead(nn.Module):
         width = 2 * config.hidden_size
         self.iterations = config.camera_iterations
         self.output_scale = config.camera_output_scale
+        self.chains = config.camera_relative_to == "previous"
         self.token_norm = nn.LayerNorm(width)
         self.empty_pose = nn.Parameter(torch.zeros(1, 1, POSE_SIZE))
         self.embed_pose = nn.Linear(POSE_SIZE, width)
@@ -75,7 +95,7 @@ class MintCameraHead(nn.Module):
                     x = layer(x, implementation)
                 step = self.pose_mlp(self.layers_norm(x)) * self.output_scale
                 poses.append(poses[-1] + step if poses else step)
-            return tuple(poses)
+            return tuple(chained(pose) for pose in poses) if self.chains else tuple(poses)
 
 
 class MintFovOutput(nn.Linear):

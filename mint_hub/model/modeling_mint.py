@@ -48,6 +48,7 @@ from .layers_mint import (
 )
 from .loading_mint import load_checked
 from .losses_mint import ATTENTION_TERM, RELEASE_STAGE_1, LossCase, LossSettings, total
+from .motion_mint import MintMotionCue, describe
 from .saving_mint import SavesCode
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
@@ -174,17 +175,28 @@ class MintAggregator(nn.Module):
             "qk_norm": True,
             "small": False,
         }
+        self.motion_cue = (
+            MintMotionCue(width, config.patch_size, config.motion_radius)
+            if config.motion_radius
+            else None
+        )
         layers, heads = range(config.aggregator_layers), config.num_attention_heads
         self.frame_layers = nn.ModuleList(MintFrameLayer(width, heads, **options) for _ in layers)
         self.global_layers = nn.ModuleList(MintGlobalLayer(width, heads, **options) for _ in layers)
 
     def forward(self, patches: Tensor, grid_hw: tuple[int, int], implementation: str) -> Tensor:
-        """(B, T, N, C) -> (B, T, P, 2C)."""
+        """(B, T, N, token size) -> (B, T, P, 2C)."""
         batch, frames = patches.shape[:2]
+        moved = None
+        if self.motion_cue is not None:
+            patches, moved = self.motion_cue(patches, grid_hw)
         specials = torch.cat([self.camera_token, self.register_token, self.scale_token], 2)
         first, later = specials.to(patches.dtype).split(1, 1)  # (1, 1, S, C) each
         specials = torch.cat([first, later.expand(-1, frames - 1, -1, -1)], 1)
-        x = torch.cat([specials.expand(batch, -1, -1, -1), patches], 2)  # (B, T, P, C)
+        specials = specials.expand(batch, -1, -1, -1)
+        if moved is not None:
+            specials = torch.cat([specials[:, :, :1] + moved, specials[:, :, 1:]], 2)
+        x = torch.cat([specials, patches], 2)  # (B, T, P, C)
         rotary = rotary_positions(grid_hw, specials.shape[2], self.head_dim, x.device)
         within = x
         for frame_layer, global_layer in zip(self.frame_layers, self.global_layers, strict=True):
@@ -359,10 +371,16 @@ class MintModel(MintPreTrainedModel):
         self.encoder.patch_embedding = value
 
     def encode_frames(self, pixel_values: Tensor) -> Tensor:
-        """Patch tokens of frames, each seen alone: (..., 3, H, W) in [0, 1] -> (..., N, C)."""
+        """Patch tokens of frames, each seen alone: (..., 3, H, W) in [0, 1] -> (..., N, C).
+
+        With a motion cue, what `describe` says of each patch follows its C numbers.
+        """
         self._check_pixels(pixel_values)
-        leading = pixel_values.shape[:-3]
-        tokens = self.encoder(pixel_values.flatten(0, -4), self.config._attn_implementation)
+        leading, frames = pixel_values.shape[:-3], pixel_values.flatten(0, -4)
+        tokens = self.encoder(frames, self.config._attn_implementation)
+        if self.config.motion_radius:
+            described = describe(frames, self.config.patch_size)
+            tokens = torch.cat([tokens, described.to(tokens.dtype)], -1)
         return tokens.unflatten(0, leading)
 
     @merge_with_config_defaults
@@ -380,7 +398,7 @@ class MintModel(MintPreTrainedModel):
 
         Args:
             pixel_values: (B, T, 3, H, W) RGB in [0, 1]; H and W multiples of the patch size.
-            patch_tokens: (B, T, N, C), instead of pixel_values.
+            patch_tokens: (B, T, N, token size), instead of pixel_values.
             grid_hw: rows and columns of patches, with patch_tokens; the configuration's by default.
             labels: the truth, by name (`LossCase`): ``pose_encoding`` (B, T, 9) relative to the
                 first frame, ``hand_state`` (B, T, 2, 109), ``presence`` (B, T, 2), and optional
@@ -409,7 +427,7 @@ class MintModel(MintPreTrainedModel):
             grid_hw = (pixel_values.shape[-2] // patch, pixel_values.shape[-1] // patch)
         else:
             grid_hw = tuple(grid_hw or self.config.grid_hw)
-            expected = (grid_hw[0] * grid_hw[1], self.config.hidden_size)
+            expected = (grid_hw[0] * grid_hw[1], self.config.token_size)
             if patch_tokens.ndim != 4 or tuple(patch_tokens.shape[-2:]) != expected:
                 raise ValueError(
                     f"patch_tokens: expected (B, T, {expected[0]}, {expected[1]}) for a grid of "

@@ -1,0 +1,119 @@
+"""The cue of motion: shifts are found where they are, and frames are still encoded alone."""
+
+import pytest
+import torch
+from huggingface_hub.errors import StrictDataclassError
+
+from mint_hub.geometry.rotations import quat_xyzw_to_matrix
+from mint_hub.inference.network import WindowNetwork
+from mint_hub.model.heads_mint import chained
+from mint_hub.model.modeling_mint import MintModel
+from mint_hub.model.motion_mint import MintMotionCue, describe
+from tests.small_model import small_config, small_model
+
+CUE = {"patch_size": 8, "image_size": (48, 64), "motion_radius": 3}
+
+
+def texture(seed: int = 0) -> torch.Tensor:
+    """A smooth random picture, (1, 3, 80, 96)."""
+    noise = torch.rand(1, 3, 80, 96, generator=torch.Generator().manual_seed(seed))
+    return torch.nn.functional.avg_pool2d(noise, 5, 1, 2)
+
+
+@pytest.mark.parametrize(("down", "right"), [(0, 0), (2, 0), (0, -2), (1, 3), (-3, 2)])
+def test_a_shifted_picture_is_found_at_its_shift(down, right):
+    """Moved by so many pixels at half size, a patch was that far back in the frame before."""
+    picture = texture()
+    crops = [
+        picture[..., 16 - dy : 64 - dy, 16 - dx : 80 - dx]
+        for dy, dx in ((0, 0), (2 * down, 2 * right))
+    ]
+    cue = MintMotionCue(4, 8, 3)
+    pixels = describe(torch.cat(crops), 8)[None]  # (1, 2, N, 16)
+    found = cue.likeness(pixels, (6, 8))[0, 1].unflatten(0, (6, 8))[1:-1, 1:-1].argmax(-1)
+    assert (found // 7 - 3 == -down).float().mean() > 0.9
+    assert (found % 7 - 3 == -right).float().mean() > 0.9
+
+
+def test_likeness_is_a_distribution_and_blind_to_light():
+    cue, frames = MintMotionCue(4, 8, 2), torch.cat([texture(1), texture(2)])[..., :48, :64]
+    pixels = describe(frames, 8)[None]
+    alike = cue.likeness(pixels, (6, 8))
+    assert alike.shape == (1, 2, 48, 25)
+    torch.testing.assert_close(alike.sum(-1), torch.ones(1, 2, 48))
+    darker = describe(0.6 * frames + 0.2, 8)[None]
+    torch.testing.assert_close(cue.likeness(darker, (6, 8)), alike, atol=0.05, rtol=0)
+
+
+def test_the_first_frame_does_not_move():
+    cue, pixels = MintMotionCue(4, 8, 2), describe(texture()[..., :48, :64], 8)[None]
+    assert (cue.likeness(pixels, (6, 8)).argmax(-1) == 12).all()  # the middle of 5 x 5
+
+
+def test_windows_from_cached_tokens_are_windows_from_pixels():
+    model = small_model(**CUE)
+    frames = torch.rand(9, 3, 48, 64)
+    with torch.no_grad():
+        tokens = torch.cat([model.encode_frames(frame[None]) for frame in frames])
+        assert tokens.shape == (9, 48, model.config.token_size)
+        whole = model(pixel_values=frames[None])
+        cached = model(patch_tokens=tokens[None])
+        plain = model(pixel_values=frames[:1].expand(9, -1, -1, -1)[None])
+    torch.testing.assert_close(cached.pose_encoding, whole.pose_encoding, atol=1e-5, rtol=0)
+    assert not torch.allclose(plain.pose_encoding, whole.pose_encoding, atol=1e-5)
+    predictions = list(WindowNetwork([model], 6, 3, 1).predict(iter(frames)))
+    assert [p.window.start for p in predictions] == [0, 3]
+
+
+def test_it_loads_as_it_was_saved_and_refuses_other_patches(tmp_path):
+    model = small_model(**CUE)
+    model.save_pretrained(tmp_path)
+    loaded = MintModel.from_pretrained(tmp_path).eval()
+    frames = torch.rand(1, 3, 3, 48, 64)
+    with torch.no_grad():
+        torch.testing.assert_close(
+            loaded(frames).pose_encoding, model(frames).pose_encoding, rtol=0, atol=0
+        )
+    with pytest.raises(StrictDataclassError, match="expected a multiple of 4 with a motion_radius"):
+        small_config(patch_size=14, motion_radius=2)
+
+
+def test_motions_chain_into_poses():
+    """T_k = D_k ... D_1, the first frame's motion left out; gradients reach every other motion."""
+    motions = torch.randn(2, 7, 7, generator=torch.Generator().manual_seed(3), dtype=torch.double)
+    motions.requires_grad_()
+    poses = chained(motions)
+    step, pose = (camera_state_matrices(x) for x in (motions.detach(), poses.detach()))
+    expected = torch.eye(4, dtype=torch.double).expand(2, 4, 4)
+    for k in range(7):
+        expected = step[:, k] @ expected if k else expected
+        torch.testing.assert_close(pose[:, k], expected)
+    poses.square().sum().backward()
+    reached = motions.grad.abs().amax((0, 2)) > 0
+    assert reached.tolist() == [False] + 6 * [True]
+
+
+def camera_state_matrices(state: torch.Tensor) -> torch.Tensor:
+    """Translation and quaternion (..., 7) -> (..., 4, 4)."""
+    R = quat_xyzw_to_matrix(state[..., 3:])
+    top = torch.cat([R, state[..., :3, None]], -1)
+    last = torch.tensor([0, 0, 0, 1.0]).to(top).expand(*top.shape[:-2], 1, 4)
+    return torch.cat([top, last], -2)
+
+
+def test_a_chained_window_begins_at_the_identity():
+    model = small_model(**CUE, camera_relative_to="previous")
+    with torch.no_grad():
+        pose = model(torch.rand(2, 5, 3, 48, 64)).pose_encoding
+    start = torch.tensor([0, 0, 0, 0, 0, 0, 1.0]).expand(2, 7)
+    torch.testing.assert_close(pose[:, 0, :7], start, rtol=0, atol=0)
+    assert (pose[:, 1:, :3].abs().sum(-1) > 0).all()
+
+
+def test_a_turn_of_the_camera_shows_in_the_moments():
+    """Every patch shifted alike: the mean shift is that shift, and nothing bends."""
+    cue, alike = MintMotionCue(4, 8, 2), torch.zeros(1, 1, 48, 25)
+    alike[..., 4 * 5 + 1] = 1  # two down, one left
+    moments = cue.moments(alike, (6, 8)).unflatten(-1, (3, 6))[0, 0]
+    torch.testing.assert_close(moments[:, 0], torch.tensor([1.0, -0.5, 1.0]))
+    torch.testing.assert_close(moments[:, 1:3], torch.zeros(3, 2), atol=1e-6, rtol=0)
