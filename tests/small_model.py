@@ -20,6 +20,7 @@ SIZES = {
     "camera_output_scale": 1.0,
     "initializer": "release",
     "motion_radius": 0,
+    "hand_crop_size": 0,
     "fov_hidden_size": 16,
     "fov_heads": 2,
     "hand_hidden_size": 32,

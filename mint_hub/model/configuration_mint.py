@@ -6,7 +6,7 @@ from typing import Any, Literal, Self
 from huggingface_hub.dataclasses import strict
 from transformers.configuration_utils import PreTrainedConfig
 
-MAY_BE_ZERO = ("num_register_tokens", "patch_stem_blocks", "motion_radius")
+MAY_BE_ZERO = ("num_register_tokens", "patch_stem_blocks", "motion_radius", "hand_crop_size")
 
 
 @strict
@@ -30,6 +30,9 @@ class MintConfig(PreTrainedConfig):
         motion_radius: largest shift, in pixels at half size, at which patches are compared with the
             frame before, as a cue of motion for small networks (`MintMotionCue`); 0, as in the
             release: patches are not compared. Needs a patch_size that is a multiple of 4.
+        hand_crop_size: side, in pixels, of a square about each hand that is looked at once more,
+            as small networks have patches as large as hands (`MintHandCrops`); 0, as in the
+            release: there is one look. A multiple of 16.
         camera_layers: depth of the camera head's trunk, run once an iteration.
         camera_heads: attention heads of the camera head, which is 2 C wide.
         camera_iterations: refinement iterations of the camera head.
@@ -77,6 +80,7 @@ class MintConfig(PreTrainedConfig):
     aggregator_layers: int = 24
     num_register_tokens: int = 4
     motion_radius: int = 0
+    hand_crop_size: int = 0
     camera_layers: int = 4
     camera_heads: int = 16
     camera_iterations: int = 4
@@ -132,6 +136,10 @@ class MintConfig(PreTrainedConfig):
             raise ValueError(
                 f"patch_size: expected a multiple of 4 with a motion_radius, got {self.patch_size}"
             )
+        if self.hand_crop_size % 16:
+            raise ValueError(
+                f"hand_crop_size: expected a multiple of 16, got {self.hand_crop_size}"
+            )
         for width, heads, factor in (
             ("hidden_size", "num_attention_heads", 4),
             ("fov_hidden_size", "fov_heads", 1),
@@ -174,9 +182,14 @@ class MintConfig(PreTrainedConfig):
         return self.hidden_size + ((self.patch_size // 2) ** 2 if self.motion_radius else 0)
 
     @property
+    def num_hand_tokens(self) -> int:
+        """Tokens that say what was seen of each hand, if they were looked at once more."""
+        return 2 if self.hand_crop_size else 0
+
+    @property
     def num_special_tokens(self) -> int:
-        """Tokens before a frame's patches: one camera, the registers, one scale."""
-        return self.num_register_tokens + 2
+        """Tokens before a frame's patches: one camera, the registers, one scale, the hands'."""
+        return self.num_register_tokens + 2 + self.num_hand_tokens
 
     @property
     def num_recorded_layers(self) -> int:
@@ -202,6 +215,7 @@ class MintConfig(PreTrainedConfig):
             "encoder_layers": 2,
             "aggregator_layers": 3,
             "motion_radius": 5,
+            "hand_crop_size": 48,
             "camera_layers": 2,
             "camera_heads": 6,
             "camera_relative_to": "previous",

@@ -12,6 +12,7 @@ from ..geometry import hand_state
 from ..geometry.hand_state import HAND_STATE_SIZE, HandState
 from ..geometry.rotations import matrix_to_quat_xyzw, quat_xyzw_to_matrix, rotvec_to_matrix
 from .configuration_mint import MintConfig
+from .crop_mint import mirror_signs
 from .layers_mint import MintCrossAttention, MintLayer, MintMLP
 
 POSE_SIZE = 7
@@ -131,6 +132,8 @@ class MintHandHead(nn.Module):
         super().__init__()
         width = config.hand_hidden_size
         self.iterations = config.hand_iterations
+        last = config.num_special_tokens
+        self.hand_slots = slice(last - config.num_hand_tokens, last)
         self.queries = nn.Parameter(torch.zeros(1, 2 * len(HAND_PARTS), width))
         self.empty_state = nn.Parameter(torch.zeros(1, 1, HAND_STATE_SIZE))
         self.token_proj = nn.Linear(2 * config.hidden_size, width)
@@ -160,6 +163,9 @@ class MintHandHead(nn.Module):
         context = self.token_norm(self.token_proj(tokens.flatten(0, 1)))  # (BT, P, H)
         keys_values = self.cross_attention.project_context(context)
         queries = self.queries.expand(context.shape[0], -1, -1)  # (BT, 8, H)
+        crops = context[:, self.hand_slots]  # (BT, 2, H), or none
+        if crops.shape[1]:
+            queries = queries + crops.repeat_interleave(len(HAND_PARTS), 1)
         states: list[Tensor] = []
         for _ in range(self.iterations):
             seen = states[-1].detach() if states else self.empty_state.expand(len(queries), 2, -1)
@@ -173,6 +179,9 @@ class MintHandHead(nn.Module):
             states.append(
                 self.refine(states[-1], x) if states else self.read(self.absolute_heads, x)
             )
+        if crops.shape[1]:  # what was seen mirrored was told mirrored
+            signs = mirror_signs().to(states[0])
+            states = [state * signs for state in states]
         return tuple(state.unflatten(0, (batch, frames)) for state in states)
 
     @staticmethod

@@ -27,6 +27,7 @@ from transformers.utils.output_capturing import OutputRecorder, capture_outputs
 from ..geometry.hand_model import HandModel
 from .configuration_mint import MintConfig
 from .conversion_mint import load_lingbot, register_conversion
+from .crop_mint import Crops, MintHandCrops
 from .heads_mint import (
     INITIAL_FOV_VH_DEG,
     INITIAL_WRIST_M,
@@ -126,6 +127,9 @@ class MintEncoder(nn.Module):
             for _ in range(config.encoder_layers)
         )
         self.norm = nn.LayerNorm(width, eps=1e-6)
+        self.hand_crops = (
+            MintHandCrops(width, config.hand_crop_size) if config.hand_crop_size else None
+        )
 
     def positions(self, grid_hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """Position embedding of the cls token (1, 1, C) and of a grid of patches (1, N, C)."""
@@ -138,8 +142,8 @@ class MintEncoder(nn.Module):
             patches = resized.flatten(2).transpose(1, 2).to(patches.dtype)
         return cls, patches
 
-    def forward(self, frames: Tensor, implementation: str) -> Tensor:
-        """(F, 3, H, W) in [0, 1] -> (F, N, C)."""
+    def forward(self, frames: Tensor, implementation: str) -> tuple[Tensor, Crops | None]:
+        """(F, 3, H, W) in [0, 1] -> (F, N, C), and what was seen of hands, if they are cut out."""
         mean, std = (
             torch.tensor(values, dtype=torch.float32, device=frames.device).view(3, 1, 1)
             for values in (IMAGE_MEAN, IMAGE_STD)
@@ -156,7 +160,11 @@ class MintEncoder(nn.Module):
         x = torch.cat([*specials, x], 1)
         for layer in self.layers:
             x = layer(x, implementation)
-        return self.norm(x)[:, 1 + self.register_tokens.shape[1] :]
+        x = self.norm(x)[:, 1 + self.register_tokens.shape[1] :]
+        crops = None
+        if self.hand_crops is not None:
+            crops = self.hand_crops(images, x, tuple(patches.shape[-2:]))
+        return x, crops
 
 
 class MintAggregator(nn.Module):
@@ -170,6 +178,11 @@ class MintAggregator(nn.Module):
         self.camera_token = nn.Parameter(torch.zeros(1, 2, 1, width))
         self.register_token = nn.Parameter(torch.zeros(1, 2, registers, width))
         self.scale_token = nn.Parameter(torch.zeros(1, 2, 1, width))
+        self.hand_token = (
+            nn.Parameter(torch.zeros(1, 1, config.num_hand_tokens, width))
+            if config.num_hand_tokens
+            else None
+        )
         options = {
             "layer_scale": config.aggregator_layer_scale,
             "qk_norm": True,
@@ -185,9 +198,11 @@ class MintAggregator(nn.Module):
         self.global_layers = nn.ModuleList(MintGlobalLayer(width, heads, **options) for _ in layers)
 
     def forward(self, patches: Tensor, grid_hw: tuple[int, int], implementation: str) -> Tensor:
-        """(B, T, N, token size) -> (B, T, P, 2C)."""
+        """(B, T, N, token size), hands' tokens behind them if there are any -> (B, T, P, 2C)."""
         batch, frames = patches.shape[:2]
-        moved = None
+        hands, moved = None, None
+        if self.hand_token is not None:
+            patches, hands = patches[:, :, :-2], patches[:, :, -2:, : self.hand_token.shape[-1]]
         if self.motion_cue is not None:
             patches, moved = self.motion_cue(patches, grid_hw)
         specials = torch.cat([self.camera_token, self.register_token, self.scale_token], 2)
@@ -196,6 +211,8 @@ class MintAggregator(nn.Module):
         specials = specials.expand(batch, -1, -1, -1)
         if moved is not None:
             specials = torch.cat([specials[:, :, :1] + moved, specials[:, :, 1:]], 2)
+        if hands is not None:
+            specials = torch.cat([specials, hands + self.hand_token], 2)
         x = torch.cat([specials, patches], 2)  # (B, T, P, C)
         rotary = rotary_positions(grid_hw, specials.shape[2], self.head_dim, x.device)
         within = x
@@ -288,7 +305,7 @@ class MintPreTrainedModel(SavesCode, PreTrainedModel):
                 init.copy_(module.position_embeddings, torch.cat([cls, patches[None]], 1))
             init.zeros_(module.mask_token)
         elif isinstance(module, MintAggregator):
-            for parameter in (module.camera_token, module.register_token, module.scale_token):
+            for parameter in module.parameters(recurse=False):
                 init.normal_(parameter, std=std if scratch else 1e-6)
         else:
             self._init_head(module, std)
@@ -373,15 +390,24 @@ class MintModel(MintPreTrainedModel):
     def encode_frames(self, pixel_values: Tensor) -> Tensor:
         """Patch tokens of frames, each seen alone: (..., 3, H, W) in [0, 1] -> (..., N, C).
 
-        With a motion cue, what `describe` says of each patch follows its C numbers.
+        With a motion cue, what `describe` says of each patch follows its C numbers; with hand
+        crops, the left and the right hand's token follow the N patches.
         """
+        return self._encode(pixel_values)[0]
+
+    def _encode(self, pixel_values: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Tokens as of `encode_frames`, and where hands were looked for, (..., 2, N)."""
         self._check_pixels(pixel_values)
         leading, frames = pixel_values.shape[:-3], pixel_values.flatten(0, -4)
-        tokens = self.encoder(frames, self.config._attn_implementation)
+        tokens, crops = self.encoder(frames, self.config._attn_implementation)
         if self.config.motion_radius:
             described = describe(frames, self.config.patch_size)
             tokens = torch.cat([tokens, described.to(tokens.dtype)], -1)
-        return tokens.unflatten(0, leading)
+        if crops is None:
+            return tokens.unflatten(0, leading), None
+        hands = nn.functional.pad(crops.tokens, (0, tokens.shape[-1] - crops.tokens.shape[-1]))
+        tokens = torch.cat([tokens, hands.to(tokens.dtype)], 1)
+        return tokens.unflatten(0, leading), crops.where.unflatten(0, leading)
 
     @merge_with_config_defaults
     @capture_outputs(tie_last_hidden_states=False)
@@ -398,7 +424,7 @@ class MintModel(MintPreTrainedModel):
 
         Args:
             pixel_values: (B, T, 3, H, W) RGB in [0, 1]; H and W multiples of the patch size.
-            patch_tokens: (B, T, N, token size), instead of pixel_values.
+            patch_tokens: (B, T, N, token size), instead of pixel_values: what `encode_frames` gave.
             grid_hw: rows and columns of patches, with patch_tokens; the configuration's by default.
             labels: the truth, by name (`LossCase`): ``pose_encoding`` (B, T, 9) relative to the
                 first frame, ``hand_state`` (B, T, 2, 109), ``presence`` (B, T, 2), and optional
@@ -416,18 +442,19 @@ class MintModel(MintPreTrainedModel):
             raise ValueError(
                 "expected exactly one of pixel_values (B, T, 3, H, W) and patch_tokens"
             )
-        implementation = self.config._attn_implementation
+        implementation, where = self.config._attn_implementation, None
         if patch_tokens is None:
             if pixel_values.ndim != 5:
                 raise ValueError(
                     f"pixel_values: expected (B, T, 3, H, W), got {tuple(pixel_values.shape)}"
                 )
             patch = self.config.patch_size
-            patch_tokens = self.encode_frames(pixel_values)
+            patch_tokens, where = self._encode(pixel_values)
             grid_hw = (pixel_values.shape[-2] // patch, pixel_values.shape[-1] // patch)
         else:
             grid_hw = tuple(grid_hw or self.config.grid_hw)
-            expected = (grid_hw[0] * grid_hw[1], self.config.token_size)
+            count = grid_hw[0] * grid_hw[1] + self.config.num_hand_tokens
+            expected = (count, self.config.token_size)
             if patch_tokens.ndim != 4 or tuple(patch_tokens.shape[-2:]) != expected:
                 raise ValueError(
                     f"patch_tokens: expected (B, T, {expected[0]}, {expected[1]}) for a grid of "
@@ -452,7 +479,7 @@ class MintModel(MintPreTrainedModel):
             presence_logits=presence,
         )
         if labels is not None:
-            case = self._loss_case(output, labels, grid_hw, looks)
+            case = self._loss_case(output, labels, grid_hw, looks, where)
             output.loss, output.losses = total(case)
         return output
 
@@ -462,6 +489,7 @@ class MintModel(MintPreTrainedModel):
         labels: Mapping[str, Tensor],
         grid_hw: tuple[int, int],
         looks: list[Tensor] | None,
+        where: Tensor | None,
     ) -> LossCase:
         patch = self.config.patch_size
         prediction = {n: output[n] for n in ("pose_encoding", "hand_state", "presence_logits")}
@@ -469,7 +497,10 @@ class MintModel(MintPreTrainedModel):
             count = grid_hw[0] * grid_hw[1]
             looks = [look[..., -count:].unflatten(1, (2, -1)) for look in looks]
             frames = output.presence_logits.shape[:2]
-            prediction["patch_attention"] = torch.cat(looks, 2).unflatten(0, frames)
+            looked = torch.cat(looks, 2).unflatten(0, frames)
+            if where is not None:
+                looked = torch.cat([looked, where[..., None, :]], -2)
+            prediction["patch_attention"] = looked
         return LossCase(
             prediction,
             labels,

@@ -160,7 +160,7 @@ def compile_layers(model: MintModel) -> None:
     """Compile stem and transformer layers in place; scores during training run as they are."""
     for module in model.modules():
         if isinstance(module, MintLayer | MintConvolutionalStem):
-            module.compile()
+            module.compile(dynamic=False)
 
 
 def last_checkpoint(out: Path) -> Path | None:

@@ -35,6 +35,7 @@ def config() -> MintConfig:
         camera_output_scale=1.0,
         initializer="release",
         motion_radius=0,
+        hand_crop_size=0,
         camera_iterations=2,
         fov_hidden_size=16,
         fov_heads=2,
