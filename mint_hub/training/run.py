@@ -149,6 +149,7 @@ def train(request: Request) -> Report:
         **({"fsdp": True, "fsdp_config": {"version": 2}} if request.fsdp else {}),
     )
     config = _config(request, checkpoint)
+    config.window = request.recipe.window
     windows = _windows(request, config, out)
     _check_windows(request, config, windows)
     facts = _facts(request, config, windows)

@@ -44,7 +44,6 @@ def config() -> MintConfig:
         hand_heads=2,
         presence_hidden_size=16,
         presence_heads=2,
-        window=WINDOW,
     )
 
 

@@ -71,6 +71,7 @@ def test_a_run_leaves_a_network_that_loads(trained, corpus):
     assert files == {"README.md", "config.json", "model.safetensors", "processor_config.json"}
     model = MintModel.from_pretrained(trained.model)
     assert model.config.hidden_size == 32
+    assert model.config.window == WINDOW != config().window
     size = MintProcessor.from_pretrained(trained.model).video_processor.size
     assert (size["height"], size["width"]) == (28, 42)
     card = (trained.model / "README.md").read_text()
