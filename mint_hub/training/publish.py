@@ -1,16 +1,21 @@
 """Make a checkpoint to hand out of training runs: the last run's network, and the record of all.
 
     python -m mint_hub.training.publish RUN [RUN ...] -o FOLDER [--results FILE ...] [--limits FILE]
+        [--presence-share S]
 
 Runs come in the order they were trained, each begun with the one before. The folder holds weights
 in half precision, config.json, the processor, run.json (command, seed, data hash, settings of every
 run), log.jsonl (the lines of all runs, frames counted through), their curve, and a card.
+
+A presence head that learnt visible shares says a hand is there when half of it is. With
+``--presence-share`` its bias is shifted so that it says so from that share on.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import shutil
 import sys
 from collections.abc import Sequence
@@ -33,7 +38,11 @@ CURVE: Final = "curve.png"
 
 
 def publish(
-    runs: Sequence[Path], out: Path, results: Sequence[Path] = (), limits: str = ""
+    runs: Sequence[Path],
+    out: Path,
+    results: Sequence[Path] = (),
+    limits: str = "",
+    presence_share: float = 0.5,
 ) -> Path:
     """Write the folder, whole or not at all; one that is there is replaced.
 
@@ -42,17 +51,24 @@ def publish(
         out: the folder to make.
         results: ``results.json`` of evaluations of it, for the tables of its card.
         limits: what the card says it cannot do, Markdown.
+        presence_share: what the presence head learnt of a hand that is told as present from now on.
 
     Raises:
-        ValueError: no runs, or a folder that holds no finished run; names it.
+        ValueError: no runs, a folder that holds no finished run, or a share out of (0, 1).
         CardError: a file is no result of an evaluation.
 
     """
     if not runs:
         raise ValueError("runs: expected at least one folder, got none")
+    if not 0 < presence_share < 1:
+        raise ValueError(
+            f"presence_share: expected more than 0 and less than 1, got {presence_share}"
+        )
     records = [_record(run) for run in runs]
     log = [line for k, run in enumerate(runs) for line in _lines(run, k, _frames(records[:k]))]
     model = MintModel.from_pretrained(runs[-1] / MODEL, dtype=torch.float32)
+    with torch.no_grad():
+        model.presence_head.classifier.bias += math.log((1 - presence_share) / presence_share)
     torch.nn.Module.to(model, torch.bfloat16)
     tables = results_sections([read_results(path) for path in results]) if results else []
     staging, before = (out.with_name(f".{out.name}.{part}") for part in ("partial", "before"))
@@ -60,9 +76,10 @@ def publish(
     try:
         model.save_pretrained(staging)
         MintProcessor.for_config(model.config).save_pretrained(staging)
-        (staging / RUN).write_text(json.dumps({"runs": records}, indent=1) + "\n")
+        facts = {"runs": records, "presence_share": presence_share}
+        (staging / RUN).write_text(json.dumps(facts, indent=1) + "\n")
         (staging / LOG).write_text("".join(json.dumps(line) + "\n" for line in log))
-        card = _card(model, records, tables, limits)
+        card = _card(model, records, tables, limits, presence_share)
         (staging / "README.md").write_text(card, encoding="utf-8")
         if any("eval_loss" in line for line in log):
             (staging / CURVE).write_bytes(canvas.png_bytes(training_curve(log)))
@@ -95,7 +112,11 @@ def _lines(run: Path, number: int, frames: int) -> list[dict[str, Any]]:
 
 
 def _card(
-    model: MintModel, records: Sequence[dict[str, Any]], tables: Sequence[str], limits: str
+    model: MintModel,
+    records: Sequence[dict[str, Any]],
+    tables: Sequence[str],
+    limits: str,
+    presence_share: float,
 ) -> str:
     size = sum(p.numel() for p in model.parameters()) / 1e6
     height, width = model.config.image_size
@@ -114,6 +135,11 @@ def _card(
         f"Each run begins with the network of the one before. `{RUN}` has every setting, `{LOG}` "
         f"every score on the way, drawn in `{CURVE}` where there are any.",
     ]
+    if presence_share != 0.5:
+        parts.append(
+            f"A hand is told as present from a predicted visible share of {presence_share:g} on: "
+            "the presence head's bias was shifted so after training."
+        )
     parts += ["## Scores\n\n" + "\n".join(tables).strip()] if tables else []
     parts += [f"## Limits\n\n{limits.strip()}"] if limits.strip() else []
     return CARD_HEAD + "\n" + "\n\n".join(parts) + "\n"
@@ -126,9 +152,10 @@ def main() -> None:
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--results", nargs="*", type=Path, default=[])
     parser.add_argument("--limits", type=Path, help="Markdown")
+    parser.add_argument("--presence-share", type=float, default=0.5)
     args = parser.parse_args()
     limits = args.limits.read_text(encoding="utf-8") if args.limits else ""
-    sys.stdout.write(f"{publish(args.runs, args.out, args.results, limits)}\n")
+    sys.stdout.write(f"{publish(args.runs, args.out, args.results, limits, args.presence_share)}\n")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Handing out a checkpoint: half precision, the record of every run, and nothing half-written."""
 
 import json
+import math
 from dataclasses import replace
 
 import cv2
@@ -83,6 +84,20 @@ def test_the_record_of_all_runs(runs, folder):
     assert card.count("\n---\n") == 1
     assert "It knows *nothing*." in card
     assert "mint-hub train --recipe stage2" in card
+
+
+def test_hands_are_told_from_the_wanted_visible_share_on(runs, folder, tmp_path):
+    """What was a logit of a quarter is a logit of 0 now; nothing else changed."""
+    shifted = publish(runs, tmp_path / "tiny", presence_share=0.25)
+    before, after = (MintModel.from_pretrained(f).state_dict() for f in (folder, shifted))
+    name = "presence_head.classifier.bias"
+    moved = (after.pop(name) - before.pop(name)).float()
+    torch.testing.assert_close(moved, torch.full((1,), math.log(3)), atol=1e-2, rtol=0)
+    assert all(torch.equal(after[n], before[n]) for n in before)
+    assert json.loads((shifted / "run.json").read_text())["presence_share"] == 0.25
+    assert "visible share of 0.25 on" in (shifted / "README.md").read_text()
+    with pytest.raises(ValueError, match="presence_share: expected more than 0"):
+        publish(runs, tmp_path / "none", presence_share=1.0)
 
 
 def test_the_curve_comes_along(folder):
