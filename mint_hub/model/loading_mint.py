@@ -47,9 +47,8 @@ def load_checked(
     forgive = kwargs.pop("ignore_mismatched_sizes", not strict)
     # Sizes are forgiven while loading so that all faults are listed together, then refused here.
     report = python_logging.getLogger("transformers.modeling_utils")
-    level = report.level
     if strict:
-        report.setLevel(python_logging.ERROR)  # our own refusal says it
+        report.addFilter(_is_error)  # our own refusal says it; the level stays, others read it
     try:
         model, info = load(
             source, *args, output_loading_info=True, ignore_mismatched_sizes=True, **kwargs
@@ -59,7 +58,7 @@ def load_checked(
     except SafetensorError as error:
         raise ValueError(f"{source}: model.safetensors is damaged or cut short: {error}") from error
     finally:
-        report.setLevel(level)
+        report.removeFilter(_is_error)
     model.config._commit_hash = getattr(revision, "resolved", None)  # for the record of results
     faults = _describe_faults(info, count_mismatched=not forgive)
     if faults and strict:
@@ -80,6 +79,10 @@ def load_checked(
             "The file is damaged or its training diverged"
         )
     return (model, info) if want_info else model
+
+
+def _is_error(record: python_logging.LogRecord) -> bool:
+    return record.levelno >= python_logging.ERROR
 
 
 def _resolve(source: str | Path, kwargs: Mapping[str, Any]) -> str | None:

@@ -1,6 +1,7 @@
 """Weights load strictly; what does not fit is listed, from a folder or a LingBot-Map file."""
 
 import json
+import logging
 import os
 
 import pytest
@@ -53,6 +54,19 @@ def test_all_faults_are_listed_together(folder):
     edit(folder, change)
     with pytest.raises(ValueError, match=r"1 missing: .*1 unexpected"):
         MintModel.from_pretrained(folder)
+
+
+@pytest.mark.parametrize("strict", [True, False])
+def test_what_fits_loads_without_a_word(folder, strict, caplog):
+    """Nor does transformers tell which layers are not spread over devices that nobody asked for."""
+    for name in ("transformers", "mint_hub"):
+        logging.getLogger(name).addHandler(caplog.handler)
+    try:
+        MintModel.from_pretrained(folder, strict=strict)
+    finally:
+        for name in ("transformers", "mint_hub"):
+            logging.getLogger(name).removeHandler(caplog.handler)
+    assert not caplog.records
 
 
 def test_strict_can_be_waived(folder):
