@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mint_hub import cli_corpus, cli_evaluate, cli_label, cli_synth, cli_train
+from mint_hub import cli_corpus, cli_demo, cli_evaluate, cli_label, cli_synth, cli_train
 from mint_hub._version import __version__
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"mint-hub {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    cli_demo.add_demo(commands)
     _add_predict(commands)
     _add_info(commands)
     _add_convert(commands)
@@ -77,8 +78,12 @@ def _add_predict(commands: Any) -> None:
     add("videos", nargs="*", help="video files, folders or URLs")
     add("--sample", action="store_true", help="the clip that comes with mint-hub")
     add("-o", "--out", type=Path, required=True, help="folder for the results")
-    weights = parser.add_mutually_exclusive_group(required=True)
-    weights.add_argument("--model", help="folder or hub repository of a MINT checkpoint")
+    weights = parser.add_mutually_exclusive_group()
+    weights.add_argument(
+        "--model",
+        help="folder or hub repository of a MINT checkpoint (default: mint-tiny, which comes with "
+        "mint-hub: for trying things, not for labelling)",
+    )
     weights.add_argument(
         "--random-weights",
         action="store_true",
@@ -167,6 +172,7 @@ def _predict(args: argparse.Namespace) -> int:
 def _runner(args: argparse.Namespace) -> "MintRunner":
     import torch
 
+    from mint_hub.assets import default_model
     from mint_hub.geometry.hand_model import HandModel
     from mint_hub.inference.devices import available_device, available_devices
     from mint_hub.inference.runner import MintRunner
@@ -186,9 +192,10 @@ def _runner(args: argparse.Namespace) -> "MintRunner":
         if args.dtype != "auto":
             cast_weights(model, getattr(torch, args.dtype))
     else:
-        if args.model.startswith((".", "/", "~")) and not Path(args.model).expanduser().is_dir():
-            raise ValueError(f"--model: no such folder: {args.model}")
-        model = MintModel.from_pretrained(args.model, dtype=args.dtype, revision=args.revision)
+        name = args.model or str(default_model())
+        if name.startswith((".", "/", "~")) and not Path(name).expanduser().is_dir():
+            raise ValueError(f"--model: no such folder: {name}")
+        model = MintModel.from_pretrained(name, dtype=args.dtype, revision=args.revision)
     import copy
 
     models = [copy.deepcopy(model) for _ in devices[1:]] + [model]

@@ -20,3 +20,8 @@ def asset_path(name: str) -> Path:
 def sample_clip() -> Path:
     """Return the path of the embedded clip: four synthetic seconds with exact truth beside it."""
     return asset_path("sample.mp4")
+
+
+def default_model() -> Path:
+    """Return the folder of the embedded network, mint-tiny: trained on synthetic clips only."""
+    return asset_path("mint_tiny")

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from mint_hub._version import __version__
+from mint_hub.assets import default_model
 from mint_hub.geometry.hand_model import HandModel
 from mint_hub.model.configuration_mint import MintConfig
 from mint_hub.model.conversion_mint import RELEASE_MARKER, config_from_layout, read_layout
@@ -39,7 +40,7 @@ def collect(model: str | None = None, mano_dir: Path | None = None) -> dict[str,
         "optional": {name: _version(name) for name in OPTIONAL},
         "devices": _devices(),
         "hand models": _hand_models(mano_dir),
-        "default checkpoint": "none embedded in this version: pass a model",
+        "default checkpoint": f"mint-tiny, embedded, synthetic clips only: {default_model()}",
     }
     if model is not None:
         facts["model"] = _describe_model(model)

@@ -9,6 +9,7 @@ import torch
 from transformers.pipelines.base import Pipeline, PipelineRegistry
 from transformers.utils import logging
 
+from mint_hub.assets import default_model
 from mint_hub.inference.devices import available_device
 from mint_hub.inference.runner import TASK, MintRunner, RunSettings
 from mint_hub.inference.video_input import key_from_name
@@ -19,13 +20,6 @@ from mint_hub.model.processing_mint import MintProcessor
 from mint_hub.model.saving_mint import SavesCode
 
 logger = logging.get_logger(__name__)
-
-NO_DEFAULT = (
-    f'pipeline("{TASK}") needs a model: no default checkpoint is embedded in this version of '
-    "mint_hub. Pass model=: a folder or hub repository with the public MINT weights "
-    '(model="ORG/NAME", see the README), one made by `mint-hub convert-checkpoint`, or a MintModel '
-    "together with processor=MintProcessor.for_config(model.config)"
-)
 
 _SETTINGS = frozenset(f.name for f in fields(RunSettings))
 _PER_VIDEO = frozenset({"camera", "camera_poses", "key"})
@@ -166,13 +160,6 @@ class _Result:
         self.episode = episode
 
 
-class _NoDefault(dict[str, Any]):
-    """Stands where transformers looks for a task's default model, and says there is none yet."""
-
-    def __getitem__(self, key: str) -> Any:
-        raise ValueError(NO_DEFAULT)
-
-
 def register_pipeline(registry: PipelineRegistry) -> None:
     """Add the task to transformers' registry (idempotent)."""
     if TASK in registry.supported_tasks:
@@ -181,7 +168,7 @@ def register_pipeline(registry: PipelineRegistry) -> None:
         TASK,
         EgocentricHandsPipeline,
         pt_model=MintModel,
-        default=_NoDefault(model=None),
+        default={"model": (str(default_model()), "main")},
         type="multimodal",
     )
 

@@ -68,7 +68,7 @@ def test_limits_and_licences_are_on_the_first_screen():
     screen = "\n".join(body.splitlines()[:30])
     assert "## Limits, before anything else" in screen
     assert "**Licences.**" in screen
-    assert "No trained weights are embedded" in screen
+    assert "learned from synthetic clips only" in screen
 
 
 def test_without_results_no_number_is_claimed():

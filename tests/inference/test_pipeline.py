@@ -162,11 +162,6 @@ def test_saved_pipeline_loads(pipe, clip, episode, tmp_path):
     assert same(pipeline("egocentric-hands", model=str(tmp_path))(str(clip)), episode)
 
 
-def test_without_a_model_the_message_says_what_to_pass():
-    with pytest.raises(ValueError, match=r"no default checkpoint is embedded.*model="):
-        pipeline("egocentric-hands")
-
-
 def test_rows_of_a_dataset(pipe, clip, episode):
     """A column named as in the corpus, undecoded cells, and columns that mean something else."""
     import datasets
