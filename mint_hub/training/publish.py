@@ -68,7 +68,7 @@ def publish(
     log = [line for k, run in enumerate(runs) for line in _lines(run, k, _frames(records[:k]))]
     model = MintModel.from_pretrained(runs[-1] / MODEL, dtype=torch.float32)
     with torch.no_grad():
-        model.presence_head.classifier.bias += math.log((1 - presence_share) / presence_share)
+        model.presence_head.classifier.bias.add_(math.log((1 - presence_share) / presence_share))
     torch.nn.Module.to(model, torch.bfloat16)
     tables = results_sections([read_results(path) for path in results]) if results else []
     staging, before = (out.with_name(f".{out.name}.{part}") for part in ("partial", "before"))
