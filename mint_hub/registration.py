@@ -44,9 +44,10 @@ def _register_class(
 
 
 def _register_pipeline(module: ModuleType) -> None:
+    from mint_hub.assets import default_model
     from mint_hub.inference.pipeline_mint import register_pipeline
 
-    register_pipeline(module.PIPELINE_REGISTRY)
+    register_pipeline(module.PIPELINE_REGISTRY, str(default_model()))
 
 
 def _register_corpus(module: ModuleType) -> None:

@@ -9,7 +9,6 @@ import torch
 from transformers.pipelines.base import Pipeline, PipelineRegistry
 from transformers.utils import logging
 
-from mint_hub.assets import default_model
 from mint_hub.inference.devices import available_device
 from mint_hub.inference.runner import TASK, MintRunner, RunSettings
 from mint_hub.inference.video_input import key_from_name
@@ -160,15 +159,15 @@ class _Result:
         self.episode = episode
 
 
-def register_pipeline(registry: PipelineRegistry) -> None:
-    """Add the task to transformers' registry (idempotent)."""
+def register_pipeline(registry: PipelineRegistry, model: str) -> None:
+    """Add the task to transformers' registry (idempotent), with the model it takes by default."""
     if TASK in registry.supported_tasks:
         return
     registry.register_pipeline(
         TASK,
         EgocentricHandsPipeline,
         pt_model=MintModel,
-        default={"model": (str(default_model()), "main")},
+        default={"model": (model, "main")},
         type="multimodal",
     )
 

@@ -42,7 +42,7 @@ def test_features_tell_pictures_and_places_apart(model):
     def spread(network):
         frames = torch.rand(8, 3, 1, 1).expand(-1, -1, 28, 42)  # one colour each
         with torch.no_grad():
-            tokens = network.encoder(frames, "eager")
+            tokens, _ = network.encoder(frames, "eager")
         return float(tokens.std(0).mean()), float(tokens.std(1).mean())
 
     torch.manual_seed(0)
