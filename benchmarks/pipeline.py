@@ -25,9 +25,9 @@ from transformers import pipeline
 
 import mint_hub
 from mint_hub.assets import sample_clip
-from mint_hub.inference.fusion import TrackBuilder
 from mint_hub.inference.network import _Device
 from mint_hub.inference.runner import MintRunner
+from mint_hub.inference.track import TrackBuilder
 from mint_hub.windows import windows
 
 
