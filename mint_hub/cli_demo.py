@@ -37,6 +37,7 @@ def _demo(args: argparse.Namespace) -> int:
     import torch
 
     from mint_hub.assets import asset_path, default_model, sample_clip
+    from mint_hub.geometry.additive_metrics import none_for_nan
     from mint_hub.inference.batch import Outputs, failures_text, find_videos, predict_videos
     from mint_hub.inference.devices import available_devices
     from mint_hub.inference.runner import MintRunner, RunSettings
@@ -62,7 +63,7 @@ def _demo(args: argparse.Namespace) -> int:
     scores = _scores(Episode.load(folder / "episode.npz"), Episode.load(asset_path("sample.npz")))
     numbers = {row: _numbers(score) for row, score in scores.items()}
     with replacing(folder / METRICS) as temporary:
-        temporary.write_text(json.dumps(numbers, indent=1) + "\n")
+        temporary.write_text(json.dumps(none_for_nan(numbers), indent=1, allow_nan=False) + "\n")
     shown = "mint-tiny" if args.model is None else Path(args.model).name
     print(_table(shown, numbers))
     print("Beside the prediction: answers that need no network. A number is only good beside them.")

@@ -6,6 +6,8 @@ from typing import Any, Literal, Self
 from huggingface_hub.dataclasses import strict
 from transformers.configuration_utils import PreTrainedConfig
 
+CROP_PATCH = 16
+"""Side of what becomes one feature of a hand's crop, pixels."""
 MAY_BE_ZERO = ("num_register_tokens", "patch_stem_blocks", "motion_radius", "hand_crop_size")
 
 
@@ -136,9 +138,9 @@ class MintConfig(PreTrainedConfig):
             raise ValueError(
                 f"patch_size: expected a multiple of 4 with a motion_radius, got {self.patch_size}"
             )
-        if self.hand_crop_size % 16:
+        if self.hand_crop_size % CROP_PATCH:
             raise ValueError(
-                f"hand_crop_size: expected a multiple of 16, got {self.hand_crop_size}"
+                f"hand_crop_size: expected a multiple of {CROP_PATCH}, got {self.hand_crop_size}"
             )
         for width, heads, factor in (
             ("hidden_size", "num_attention_heads", 4),

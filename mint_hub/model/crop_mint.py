@@ -9,11 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from ..geometry.hand_state import HAND_STATE_SIZE
-from .layers_mint import MintConvolutionalStem
+from .configuration_mint import CROP_PATCH
+from .layers_mint import MintConvolutionalStem, patch_centres
 
 SIDES = 2
-CROP_PATCH = 16
-"""Side of what becomes one feature of a crop, pixels."""
 
 
 class Crops(NamedTuple):
@@ -53,10 +52,12 @@ class MintHandCrops(nn.Module):
     @torch.no_grad()
     def centre(where: Tensor, grid_hw: tuple[int, int]) -> Tensor:
         """Means (F, 2, 2) of squared shares, x and y in -1 to 1 over the picture."""
-        y, x = (torch.linspace(1 / n - 1, 1 - 1 / n, n, device=where.device) for n in grid_hw)
-        y, x = (side.flatten() for side in torch.meshgrid(y, x, indexing="ij"))
         share = where.square()
-        return share @ torch.stack([x, y], -1) / share.sum(-1, keepdim=True)
+        return (
+            share
+            @ torch.stack(patch_centres(grid_hw, where.device), -1)
+            / share.sum(-1, keepdim=True)
+        )
 
     @torch.no_grad()
     def cut(self, images: Tensor, centre: Tensor) -> Tensor:

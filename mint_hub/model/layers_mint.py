@@ -70,6 +70,13 @@ def rotary_positions(grid_hw: tuple[int, int], num_special: int, head_dim: int, 
     return angles.cos(), angles.sin()
 
 
+def patch_centres(grid_hw: tuple[int, int], device) -> tuple[Tensor, Tensor]:
+    """Centres x and y of patches, (N,) each, row by row, in -1 to 1 over the picture."""
+    y, x = (torch.linspace(1 / n - 1, 1 - 1 / n, n, device=device) for n in grid_hw)
+    y, x = torch.meshgrid(y, x, indexing="ij")
+    return x.flatten(), y.flatten()
+
+
 def rotate(x: Tensor, rotary: Rotary) -> Tensor:
     """Apply rotary positions of one frame to x (B, h, L, d), L a whole number of frames."""
     cos, sin = (part.to(x.dtype) for part in rotary)

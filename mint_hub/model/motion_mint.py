@@ -7,7 +7,7 @@ which patches are compared: pictures at half size.
 import torch
 from torch import Tensor, nn
 
-from .layers_mint import MintMLP
+from .layers_mint import MintMLP, patch_centres
 
 box_mean = nn.functional.avg_pool2d
 
@@ -92,8 +92,7 @@ class MintMotionCue(nn.Module):
         """Moments (B, T, MOMENTS) of mean shifts, and of how sure they are, over the picture."""
         steps = torch.linspace(-1, 1, 2 * self.radius + 1, device=alike.device)
         shifts = torch.cartesian_prod(steps, steps)  # (shifts, 2), down and right
-        y, x = (torch.linspace(1 / n - 1, 1 - 1 / n, n, device=alike.device) for n in grid_hw)
-        y, x = (side.flatten() for side in torch.meshgrid(y, x, indexing="ij"))
+        x, y = patch_centres(grid_hw, alike.device)
         places = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)  # (N, 6)
         sure = alike.square().sum(-1, keepdim=True)
         seen = torch.cat([sure * (alike @ shifts), sure], -1)  # (B, T, N, 3)
