@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-PRESETS = ("train", "bench", "bench-ood")
+PRESETS = ("train", "train-lively", "bench", "bench-ood")
 
 
 def add_synth(commands: Any) -> None:
@@ -24,6 +24,13 @@ def add_synth(commands: Any) -> None:
     add("--config", help="name of the config (default: synth-PRESET)")
     add("--split", choices=("train", "validation"), help="default: train; of benches: validation")
     add("--frames", type=int, help="frames of every clip (default: 150 to 240, drawn)")
+    add(
+        "--pieces",
+        type=int,
+        default=0,
+        help="instead of whole clips, so many pieces of --frames frames of each, spread over it: "
+        "more rooms and people for the frames drawn; train only",
+    )
     add("--samples", type=int, default=4, help="a pixel: 0, 2 or 4; 0 is a third faster")
     add("--scale", type=float, default=1.0, help="factor on the size of pictures (default: 1)")
     add(
@@ -44,12 +51,12 @@ def add_synth(commands: Any) -> None:
 
 def _synth(args: argparse.Namespace) -> int:
     from mint_hub.loaders.card import write_card
-    from mint_hub.synth.episodes import synthesise
+    from mint_hub.synth.corpus import synthesise
 
     if args.jobs < 1:
         raise ValueError(f"--jobs: expected at least 1, got {args.jobs}")
-    if args.episodes is None and args.preset == "train":
-        raise ValueError("--episodes: expected how many clips of train to make, got none")
+    if args.episodes is None and args.preset.startswith("train"):
+        raise ValueError(f"--episodes: expected how many clips of {args.preset}, got none")
     if args.out.exists() and not args.out.is_dir():
         raise ValueError(f"-o {args.out}: expected a folder, got a file")
     report = synthesise(
@@ -60,6 +67,7 @@ def _synth(args: argparse.Namespace) -> int:
         config=args.config,
         split=args.split,
         num_frames=args.frames,
+        pieces=args.pieces,
         scale=args.scale,
         samples=args.samples,
         lens=args.lens,

@@ -84,7 +84,7 @@ def synthetic_benchmark(source: Source, num_procs: int = 1) -> ShardsBenchmark:
         BenchmarkError: other clips lie there than were frozen.
 
     """
-    from mint_hub.synth.episodes import synthesise
+    from mint_hub.synth.corpus import synthesise
     from mint_hub.synth.frozen import require_frozen
     from mint_hub.synth.presets import GENERATOR, REVISION, preset_named
 

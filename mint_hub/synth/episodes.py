@@ -1,10 +1,9 @@
-"""From worlds to episodes: pictures, exact labels, and shards like those of any other source.
+"""From worlds to episodes: pictures and exact labels.
 
 A hand counts as present when any of its 21 joints, more than 1 cm before the camera, projects into
 the image. ``presence_score``, which a presence head should learn from, is then the share of what
 lies of it inside the picture that nothing hides (``Renderer.visible_fraction``), and 0 for a hand
-that is not present: one whose skin reaches into the picture, but none of its joints. Labels are
-written ``lossless``: they are exact.
+that is not present: one whose skin reaches into the picture, but none of its joints.
 
 A clip filmed through a lens has bent pictures (depth and segments with them), and presence is what
 these show. Its camera is, by the convention of ``Episode``, a pinhole: that of
@@ -15,12 +14,9 @@ into those of the labels.
 from __future__ import annotations
 
 import io
-import multiprocessing
-import os
 import zipfile
-from collections.abc import Collection, Generator, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
-from os import PathLike
 from typing import Any, Final
 
 import numpy as np
@@ -29,12 +25,9 @@ from numpy.typing import NDArray
 from mint_hub.conventions import MODEL_FPS
 from mint_hub.geometry.hand_model import HandModel
 from mint_hub.geometry.hand_state import absent
-from mint_hub.loaders.parallel import in_order
 from mint_hub.loaders.schema import Episode
-from mint_hub.loaders.shards import CorpusReport, write_corpus
 from mint_hub.synth.corruption import Corruption, corrupt, encode
 from mint_hub.synth.figure import LEFT_HAND, RIGHT_HAND
-from mint_hub.synth.gl import make_context
 from mint_hub.synth.lensing import (
     Bend,
     draw_lens,
@@ -43,7 +36,7 @@ from mint_hub.synth.lensing import (
     require_share,
     seen_through,
 )
-from mint_hub.synth.presets import GENERATOR, REVISION, key_of, preset_named, rng_of, seed_of
+from mint_hub.synth.presets import preset_named, rng_of
 from mint_hub.synth.render import SAMPLES, Rendered, Renderer
 from mint_hub.synth.scene import make_world
 from mint_hub.synth.world import World
@@ -51,16 +44,17 @@ from mint_hub.synth.world import World
 __all__ = [
     "DEPTH_STEP_M",
     "Clip",
+    "check_pieces",
+    "check_samples",
+    "check_scale",
     "draw_corruption",
     "labels_of",
     "make_clip",
     "make_episode",
+    "make_pieces",
+    "piece_key",
     "presence_of",
-    "synthesise",
 ]
-
-SHARD_BYTES: Final = 8 << 20
-"""A handful of clips: what an interrupted run makes again is less than a shard."""
 
 MP4: Final = "mp4"
 DEPTH: Final = "depth.npz"
@@ -70,6 +64,7 @@ DEPTH_STEP_M: Final = 2.0**-12
 """Depth is stored as uint16 multiples of this, a quarter of a millimetre; 0 where there is none."""
 
 _CAMERA_STREAM: Final = 7
+_PIECE_STREAM: Final = 11
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +233,7 @@ def _npz(name: str, array: NDArray[Any]) -> bytes:
     return buffer.getvalue()
 
 
-# --------------------------------------------------------------------------------- shards
+# ---------------------------------------------------------------------------------- clips
 
 
 def make_clip(
@@ -267,23 +262,87 @@ def make_clip(
 
     """
     require_share(lens, preset)
-    _check_samples(samples)
-    world = _scaled(make_world(seed, preset, num_frames), scale)
-    drawn = draw_lens(world, lens)
-    world = world if drawn is None else seen_through(world, drawn)
+    check_samples(samples)
+    world = _filmed(seed, preset, num_frames, scale, lens)
     with Renderer(world.image_size_hw, samples=samples) as renderer:
         return make_episode(
             world, renderer, depth=depth, segmentation=segmentation, corruption=corruption
         )
 
 
-def _check_samples(samples: int) -> int:
+def make_pieces(
+    seed: int,
+    preset: str = "train",
+    num_frames: int = 16,
+    pieces: int = 3,
+    *,
+    scale: float = 1.0,
+    samples: int = SAMPLES,
+    lens: float = 0.0,
+    depth: bool = False,
+    segmentation: bool = False,
+) -> list[Clip]:
+    """Make a world of full length, but draw pieces of it alone: one in each part of it, in order.
+
+    For the frames that are drawn, training then sees more rooms and people than in whole clips, and
+    later moments than in short ones, which begin where hands still rest. Keys are the world's
+    with the number of the piece, ``meta["synth"]["first_frame"]`` is where it began.
+
+    Raises:
+        ImportError, RuntimeError: as `make_clip` does.
+        ValueError: as `make_clip` does; a bench, or more frames than its clips may have.
+
+    """
+    require_share(lens, preset)
+    check_samples(samples)
+    check_pieces(pieces, num_frames, preset)
+    world = _filmed(seed, preset, None, scale, lens)
+    rng = rng_of(preset, seed, _PIECE_STREAM)
+    part = world.num_frames / pieces
+    spare = part - num_frames
+    firsts = [int(n * part + rng.uniform() * spare) for n in range(pieces)]
+    clips: list[Clip] = []
+    with Renderer(world.image_size_hw, samples=samples) as renderer:
+        for number, first in enumerate(firsts):
+            piece = replace(world.cut(first, num_frames), key=piece_key(world.key, number))
+            clips.append(make_episode(piece, renderer, depth=depth, segmentation=segmentation))
+    return clips
+
+
+def piece_key(key: str, number: int) -> str:
+    """Key of a piece of the clip of a key."""
+    return f"{key}-{number}"
+
+
+def _filmed(seed: int, preset: str, num_frames: int | None, scale: float, lens: float) -> World:
+    """The world of a seed, with pictures of another size, through its lens if it has one."""
+    world = _scaled(make_world(seed, preset, num_frames), scale)
+    drawn = draw_lens(world, lens)
+    return world if drawn is None else seen_through(world, drawn)
+
+
+def check_pieces(pieces: int, num_frames: int | None, preset: str) -> None:
+    """Refuse pieces of a bench, or more frames than the shortest clip has; ValueError."""
+    kind = preset_named(preset)
+    least = kind.num_frames[0]
+    if kind.clips is not None:
+        raise ValueError(f"pieces: expected whole clips of {preset}, got {pieces}")
+    if num_frames is None or not 1 <= num_frames * pieces <= least:
+        raise ValueError(
+            f"pieces: expected num_frames * pieces within 1 to {least}, the shortest clip of "
+            f"{preset}; got num_frames {num_frames}, pieces {pieces}"
+        )
+
+
+def check_samples(samples: int) -> int:
+    """Refuse any number but 0, 2 and 4; ValueError."""
     if samples not in (0, 2, 4):
         raise ValueError(f"samples: expected 0, 2 or 4 a pixel, got {samples}")
     return samples
 
 
-def _check_scale(scale: float) -> float:
+def check_scale(scale: float) -> float:
+    """Refuse sizes out of 0.1 to 4; ValueError."""
     if not 0.1 <= scale <= 4:
         raise ValueError(f"scale: expected 0.1 to 4, got {scale}")
     return scale
@@ -291,148 +350,7 @@ def _check_scale(scale: float) -> float:
 
 def _scaled(world: World, scale: float) -> World:
     """Change the size of the pictures, to even numbers of pixels; the field of view stays."""
-    if _check_scale(scale) == 1:
+    if check_scale(scale) == 1:
         return world
     height, width = (2 * max(round(side * scale / 2), 1) for side in world.image_size_hw)
     return replace(world, image_size_hw=(height, width))
-
-
-def synthesise(
-    folder: str | PathLike[str],
-    preset: str = "train",
-    episodes: int | None = None,
-    seed: int = 0,
-    *,
-    config: str | None = None,
-    split: str | None = None,
-    num_frames: int | None = None,
-    scale: float = 1.0,
-    samples: int = SAMPLES,
-    lens: float = 0.0,
-    depth: bool = False,
-    segmentation: bool = False,
-    num_procs: int = 1,
-    progress: bool = False,
-) -> CorpusReport:
-    """Write a split of synthetic clips, ``folder/config/split``; called again, it goes on.
-
-    Going on, it keeps the shards that were finished, and makes no clip of these again.
-
-    Args:
-        folder: of the corpus.
-        preset: "train", "bench" or "bench-ood".
-        episodes: how many; by default all of a bench, and it must be said for train.
-        seed: of the run; a bench's clips are the same for every seed.
-        config: name of the config; ``synth-<preset>`` without it.
-        split: "train" for train, "validation" for the benches without it.
-        num_frames: of every clip; drawn per clip without it.
-        scale: factor on the size of the pictures, height and width.
-        samples: a pixel: 0, 2 or 4; see `make_clip`.
-        lens: share of clips whose pictures are bent by a lens; 0 for benches.
-        depth: also store depth.
-        segmentation: also store segments.
-        num_procs: processes that make clips.
-        progress: show a bar.
-
-    Raises:
-        ImportError, RuntimeError: as ``make_clip`` does.
-        CorpusError: as ``write_corpus`` does; an unfinished split was begun with other arguments.
-        ValueError: an unknown preset, a number of episodes that it does not have, a bad scale
-            or share of lenses.
-
-    """
-    kind = preset_named(preset)
-    count = kind.clips if episodes is None else episodes
-    if count is None or count < 1:
-        raise ValueError(f"episodes: expected at least 1 for {preset}, got {episodes}")
-    seeds = [seed_of(preset, seed, n) for n in range(count)]
-    if num_frames is not None and num_frames < 1:
-        raise ValueError(f"num_frames: expected at least 1, got {num_frames}")
-    maker = _Maker(
-        preset,
-        num_frames,
-        _check_scale(scale),
-        _check_samples(samples),
-        require_share(lens, preset),
-        depth,
-        segmentation,
-    )
-    make_context().release()  # say what is missing before a world or a folder is made
-    clips = _Clips(maker, seeds, num_procs)
-    try:
-        return write_corpus(
-            clips,
-            folder,
-            config or f"synth-{preset}",
-            split or ("train" if kind.clips is None else "validation"),
-            format="lossless",
-            extra=True,
-            shard_bytes=SHARD_BYTES,
-            seed=None,
-            progress=progress,
-            extra_members=clips.members_of,
-            made_with={
-                **asdict(maker),
-                **({"seed": seed} if kind.clips is None else {}),
-                "generator": GENERATOR,
-                "revision": REVISION,
-            },
-        )
-    finally:
-        clips.close()
-
-
-@dataclass(frozen=True)
-class _Maker:
-    """Makes the clip of a seed; travels to other processes."""
-
-    preset: str
-    num_frames: int | None
-    scale: float
-    samples: int
-    lens: float
-    depth: bool
-    segmentation: bool
-
-    def __call__(self, seed: int) -> Clip:
-        if multiprocessing.parent_process() is not None:
-            # One of several: Mesa draws on this process's own core, without threads beside it.
-            os.environ.setdefault("LP_NUM_THREADS", "0")
-        return make_clip(seed, **asdict(self))
-
-
-class _Clips:
-    """Clips by number, in a row from the first that is asked for; other processes make them ahead.
-
-    Their keys are known before they are made.
-    """
-
-    def __init__(self, maker: _Maker, seeds: Collection[int], num_procs: int) -> None:
-        self._maker, self._seeds, self._num_procs = maker, list(seeds), num_procs
-        self._stream: Generator[Clip] | None = None
-        self._next = -1
-        self._members: dict[str, dict[str, bytes]] = {}
-
-    def __len__(self) -> int:
-        return len(self._seeds)
-
-    def __getitem__(self, i: int, /) -> Episode:
-        if self._stream is None or i != self._next:
-            self.close()
-            self._stream = in_order(self._maker, self._seeds[i:], self._num_procs, 1, start="spawn")
-        clip = next(self._stream)
-        assert clip.episode.key == self.key(i)
-        self._next = i + 1
-        self._members = {clip.episode.key: clip.members}
-        return clip.episode
-
-    def key(self, i: int, /) -> str:
-        return key_of(self._maker.preset, self._seeds[i])
-
-    def members_of(self, episode: Episode) -> dict[str, bytes]:
-        return self._members[episode.key]
-
-    def close(self) -> None:
-        if self._stream is not None:
-            self._stream.close()
-            self._stream = None

@@ -1,6 +1,7 @@
-"""The three presets, and which clips a trainer must refuse.
+"""The presets, and which clips a trainer must refuse.
 
-``train`` is unbounded. ``bench`` is forty clips of the same generator from reserved seeds.
+``train`` is unbounded, and ``train-lively`` is ``train`` where heads move as much as in the benches
+(in ``train``, many hold still). ``bench`` is forty clips of the same generator from reserved seeds.
 ``bench-ood`` is forty clips whose things, surfaces, activities, fields of view, image sizes, camera
 heights and sides, and hand shapes train cannot produce: those tables and ranges are disjoint. A
 preset's seeds are a stream of their own: no seed of ``train`` gives a clip of a bench.
@@ -16,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from types import MappingProxyType
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 
@@ -59,7 +60,6 @@ RESERVED_SEEDS: Final = 1 << 48
 """Worlds of train from this seed on are set apart: no run of `mint-hub synth` draws them, whatever
 its seed (`seed_of` stays below). The clips that travel with the package are of these."""
 
-PresetName = Literal["train", "bench", "bench-ood"]
 Range = tuple[float, float]
 
 
@@ -113,6 +113,7 @@ _TRAIN: Final = Preset()
 _BENCH: Final = replace(
     _TRAIN, name="bench", stream=2, clips=BENCH_CLIPS, sway=(0.8, 1.4), least_step=(0.006, 0.6)
 )
+_LIVELY: Final = replace(_BENCH, name="train-lively", stream=4, clips=None)
 _OOD: Final = replace(
     _BENCH,
     name="bench-ood",
@@ -130,7 +131,7 @@ _OOD: Final = replace(
     hand_size=((-2.8, -2.1), (2.1, 2.8)),
     other_shape=(1.6, 2.3),
 )
-PRESETS: Final[dict[str, Preset]] = {p.name: p for p in (_TRAIN, _BENCH, _OOD)}
+PRESETS: Final[dict[str, Preset]] = {p.name: p for p in (_TRAIN, _LIVELY, _BENCH, _OOD)}
 
 
 def preset_named(name: str) -> Preset:

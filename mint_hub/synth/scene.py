@@ -65,7 +65,7 @@ def make_world(seed: int, preset: str = "train", num_frames: int | None = None) 
 
     Args:
         seed: any number from 0; for a bench, the number of its clip (see ``presets.seed_of``).
-        preset: "train", "bench" or "bench-ood".
+        preset: one of ``presets.PRESETS``.
         num_frames: of the clip; drawn from the preset's range without it.
 
     Raises:

@@ -7,7 +7,7 @@ those of :mod:`mint_hub.conventions`. Colours are linear reflectances or intensi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
@@ -189,3 +189,43 @@ class World:
     def num_frames(self) -> int:
         """T."""
         return len(self.T_camera_from_world)
+
+    def cut(self, first: int, count: int) -> World:
+        """Frames first <= k < first + count, as a world of the same key.
+
+        Raises:
+            ValueError: it has not all of these frames.
+
+        """
+        if first < 0 or count < 1 or first + count > self.num_frames:
+            raise ValueError(
+                f"{self.key}: expected frames within 0 to {self.num_frames}, got {first} to "
+                f"{first + count}"
+            )
+        of = slice(first, first + count)
+        bodies = [
+            replace(body, T_world_from_body=body.T_world_from_body[of])
+            if body.T_world_from_body.ndim == 3
+            else body
+            for body in self.bodies
+        ]
+        hands = replace(
+            self.hands,
+            hand_state=self.hands.hand_state[of],
+            exists=self.hands.exists[of],
+            forearm_direction=self.hands.forearm_direction[of],
+        )
+        said = [
+            replace(text, start=max(text.start - first, 0), end=min(text.end - first, count))
+            for text in self.text
+            if text.start < first + count and text.end > first
+        ]
+        return replace(
+            self,
+            bodies=tuple(bodies),
+            hands=hands,
+            T_camera_from_world=self.T_camera_from_world[of],
+            exposure=None if self.exposure is None else self.exposure[of],
+            text=tuple(said),
+            meta={**self.meta, "first_frame": first},
+        )

@@ -2,32 +2,29 @@
 
 import dataclasses
 import io
-import re
-import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
-from mint_hub.cli import main
 from mint_hub.conventions import KEYPOINT_NAMES
 from mint_hub.geometry.camera import fov_vh_to_K, on_screen, project, unproject
 from mint_hub.geometry.hand_model import HandModel
-from mint_hub.geometry.lenses import Lens
 from mint_hub.geometry.rigid import inverse, transform_points
 from mint_hub.loaders.clips import PackedClip
-from mint_hub.loaders.integrity import verify
-from mint_hub.loaders.packing import pixel_window
-from mint_hub.loaders.reader import CorpusReader
-from mint_hub.loaders.shards import CorpusError
 from mint_hub.synth import episodes
 from mint_hub.synth.corruption import Corruption
-from mint_hub.synth.episodes import DEPTH_STEP_M, Clip, make_episode, presence_of, synthesise
-from mint_hub.synth.presets import is_bench, seed_of
+from mint_hub.synth.episodes import (
+    DEPTH_STEP_M,
+    labels_of,
+    make_episode,
+    make_pieces,
+    presence_of,
+)
+from mint_hub.synth.presets import is_bench
 from mint_hub.synth.render import Renderer
 from mint_hub.synth.scene import make_world
-from tests.corpus_faults import tree
-from tests.episodes import make_episode as make_labels
 from tests.small_world import SIZE_HW, small_world, two_hands
 
 FRAMES = 6
@@ -191,184 +188,40 @@ def test_drawn_cameras_differ():
     assert settings[0] == episodes.draw_corruption(make_world(0, "train", 1))
 
 
-# --------------------------------------------------------------------------- shards
+# --------------------------------------------------------------------------- pieces
 
 
-@pytest.fixture(scope="module")
-def corpus(renderer, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("synth")
-    synthesise(folder, "train", 2, seed=1, num_frames=3)
-    return folder
+def test_a_part_of_a_world_has_the_labels_of_those_frames():
+    world = make_world(3, "train", 40)
+    whole, part = (labels_of(w, None, Corruption()) for w in (world, world.cut(11, 9)))
+    frames = slice(11, 20)
+    for name in ("T_camera_from_world", "hand_state", "presence", "fov_vh_rad"):
+        np.testing.assert_array_equal(getattr(part, name), getattr(whole, name)[frames], name)
+    assert part.meta["synth"]["first_frame"] == 11
+    for moving, before in zip(world.cut(11, 9).bodies, world.bodies, strict=True):
+        np.testing.assert_array_equal(moving.pose(2), before.pose(13))
+    said = {text.id: (text.start + 11, text.end + 11) for text in part.text}
+    expected = {t.id: (max(t.start, 11), min(t.end, 20)) for t in whole.text}
+    assert said == {key: span for key, span in expected.items() if span[0] < span[1]}
+    assert said
+    with pytest.raises(ValueError, match="expected frames within 0 to 40, got 35 to 44"):
+        world.cut(35, 9)
 
 
-def test_shards_read_like_any_other(corpus):
-    assert verify(corpus, "full").ok
-    reader = CorpusReader(corpus, "synth-train", "train")
-    assert len(reader) == 2
-    window = pixel_window(reader, 1)
-    assert window.images.shape[0] == window.episode.num_frames == 3
-    assert reader[1].presence_score is not None
-    assert reader[1].meta["scale_status"] == "exact (synthetic)"
-
-
-class Maker:
-    """Stands for ``make_clip``: labels alone, one clip a shard; interrupted at seed ``stop``."""
-
-    def __init__(self, stop: int | None = None) -> None:
-        self.stop, self.seeds = stop, list[int]()
-
-    def __call__(self, seed: int, preset: str, *_: object, **__: object) -> Clip:
-        self.seeds.append(seed)
-        if seed == self.stop:
-            raise KeyboardInterrupt
-        return Clip(make_labels(3, key=f"synth-{preset}-{seed:x}"), {"mp4": b"%d" % seed})
-
-
-@pytest.fixture
-def begun(renderer, tmp_path, monkeypatch):
-    """Make runs of four clips, of train and of the bench, that stop at the fourth."""
-    monkeypatch.setattr(episodes, "SHARD_BYTES", 1)
-    for preset in ("train", "bench"):
-        monkeypatch.setattr(episodes, "make_clip", Maker(stop=seed_of(preset, 1, 3)))
-        with pytest.raises(KeyboardInterrupt):
-            synthesise(tmp_path, preset, 4, seed=1, num_frames=3)
-    monkeypatch.setattr(episodes, "make_clip", Maker())
-    return tmp_path
-
-
-@pytest.mark.parametrize(("preset", "seed"), [("train", 1), ("bench", 2)])
-def test_an_interrupted_run_goes_on_with_the_clips_that_are_missing(
-    begun, tmp_path_factory, preset, seed
-):
-    """A bench's clips are the same for every seed, and 1 is the scale 1.0."""
-    report = synthesise(begun, preset, 4, seed=seed, num_frames=3, scale=1)
-    assert (report.kept_shards, report.num_shards) == (2, 4)  # the third was still open
-    assert episodes.make_clip.seeds == [seed_of(preset, 1, n) for n in (2, 3)]
-    whole = tmp_path_factory.mktemp("whole")
-    synthesise(whole, preset, 4, seed=1, num_frames=3)
-    split = report.folder.relative_to(begun)
-    assert tree(begun / split) == tree(whole / split)
-
-
-def test_keys_are_those_of_the_clips(corpus):
-    reader = CorpusReader(corpus, "synth-train", "train")
-    keys = [f"synth-train-{seed_of('train', 1, n):x}" for n in range(2)]
-    assert [episode.key for episode in reader] == keys
-
-
-@pytest.mark.parametrize(
-    ("preset", "other", "message"),
-    [
-        ("train", {"num_frames": 4}, "num_frames 3 as it was begun, got 4"),
-        ("train", {"num_frames": None}, "num_frames 3 as it was begun, got None"),
-        ("train", {"scale": 0.5}, "scale 1.0 as it was begun, got 0.5"),
-        ("train", {"samples": 0}, "samples 4 as it was begun, got 0"),
-        ("train", {"lens": 0.5}, "lens 0.0 as it was begun, got 0.5"),
-        ("train", {"depth": True}, "depth False as it was begun, got True"),
-        ("train", {"segmentation": True}, "segmentation False as it was begun, got True"),
-        ("train", {"seed": 2}, "seed 1 as it was begun, got 2"),
-        ("bench", {"scale": 0.5}, "scale 1.0 as it was begun, got 0.5"),
-    ],
-)
-def test_other_arguments_do_not_go_on(begun, preset, other, message):
-    before = tree(begun)
-    with pytest.raises(CorpusError, match=f"{re.escape(message)}: resume with the same arguments"):
-        synthesise(begun, preset, 4, **{"seed": 1, "num_frames": 3, **other})
-    assert tree(begun) == before
-
-
-def test_another_generator_does_not_go_on(begun, monkeypatch):
-    monkeypatch.setattr(episodes, "REVISION", episodes.REVISION + 1)
-    with pytest.raises(CorpusError, match="expected revision"):
-        synthesise(begun, "train", 4, seed=1, num_frames=3)
-
-
-def test_processes_do_not_matter(corpus, tmp_path):
-    synthesise(tmp_path, "train", 2, seed=1, num_frames=3, num_procs=2)
-    one, two = (next((f / "synth-train" / "train").glob("*.tar")) for f in (corpus, tmp_path))
-    assert one.read_bytes() == two.read_bytes()
-
-
-def test_the_command_line_makes_a_bench_clip(renderer, tmp_path, capsys):
-    call = ["synth", "--preset", "bench", "--episodes", "1", "--frames", "2", "--quiet"]
-    assert main([*call, "-o", str(tmp_path)]) == 0
-    assert (tmp_path / "README.md").is_file()
-    (episode,) = CorpusReader(tmp_path, "synth-bench", "validation")
-    assert is_bench(episode)
-    assert main([*call, "-o", str(tmp_path)]) == 2
-    assert "expected no such split yet" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ([], "--episodes: expected how many"),
-        (["--episodes", "0"], "episodes: expected at least 1"),
-        (["--episodes", "-3", "--preset", "bench"], "episodes: expected at least 1"),
-        (["--episodes", "1", "--jobs", "0"], "--jobs: expected at least 1"),
-        (["--episodes", "1", "--frames", "0"], "num_frames: expected at least 1, got 0"),
-        (["--episodes", "1", "--seed", "-2"], "seed: expected 0 or more, got -2"),
-        (["--episodes", "1", "--scale", "0"], "scale: expected 0.1 to 4, got 0.0"),
-        (["--episodes", "1", "--scale", "nan"], "scale: expected 0.1 to 4, got nan"),
-        (["--episodes", "1", "--samples", "3"], "samples: expected 0, 2 or 4 a pixel, got 3"),
-        (["--episodes", "1", "--lens", "1.1"], "lens: expected a share of clips from 0 to 1"),
-        (["--lens", "0.5", "--preset", "bench"], "lens: expected 0 for bench"),
-        (["--episodes", "41", "--preset", "bench"], "bench has 40 clips"),
-    ],
-)
-def test_bad_arguments_are_named(arguments, message, tmp_path, capsys):
-    assert main(["synth", *arguments, "-o", str(tmp_path), "--quiet"]) == 2
-    said = capsys.readouterr().err.strip()
-    assert message in said
-    assert "\n" not in said
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_file_where_the_corpus_should_be_is_named(tmp_path, capsys):
-    (tmp_path / "taken").write_text("mine")
-    call = ["synth", "--episodes", "1", "-o", str(tmp_path / "taken"), "--quiet"]
-    assert main(call) == 2
-    said = capsys.readouterr().err.strip()
-    assert "expected a folder, got a file" in said
-    assert "\n" not in said
-    assert (tmp_path / "taken").read_text() == "mine"
-
-
-def test_an_unknown_preset_is_named(tmp_path, capsys):
-    with pytest.raises(SystemExit) as left:
-        main(["synth", "--preset", "kitchen", "--episodes", "1", "-o", str(tmp_path)])
-    assert left.value.code == 2
-    assert "invalid choice: 'kitchen'" in capsys.readouterr().err
-    with pytest.raises(ValueError, match=r"preset: expected one of .*'train'.*, got 'kitchen'"):
-        synthesise(tmp_path, "kitchen", 1)
-
-
-class WithoutEgl:
-    """A moderngl that finds no driver."""
-
-    @staticmethod
-    def create_standalone_context(**_):
-        raise OSError("libEGL.so: cannot open shared object file")
-
-
-@pytest.mark.parametrize(
-    ("module", "message"),
-    [(None, 'pip install "mint-hub[synth]"'), (WithoutEgl, "libegl1 libgl1-mesa-dri")],
-)
-def test_what_is_missing_is_one_line(module, message, tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "moderngl", module)
-    call = ["synth", "--episodes", "1", "--frames", "1", "-o", str(tmp_path), "--quiet"]
-    assert main(call) == 2
-    said = capsys.readouterr().err.strip()
-    assert message in said
-    assert "\n" not in said
-    assert not list(tmp_path.iterdir())
-
-
-def test_the_command_line_bends_pictures(renderer, tmp_path):
-    call = ["synth", "--episodes", "1", "--frames", "1", "--scale", "0.2", "--lens", "1"]
-    assert main([*call, "--seed", "4", "-o", str(tmp_path), "--quiet"]) == 0
-    (episode,) = CorpusReader(tmp_path, "synth-train", "train")
-    lens = Lens.from_dict(episode.meta["synth"]["lens"])
-    assert lens.image_size_hw == episode.image_size_hw
-    assert any(lens.distortion)
+def test_pieces_are_drawn_as_the_whole_clip_is(renderer):
+    """Each in its own part of the clip, and the picture of its first frame is the clip's there."""
+    calm = Corruption()
+    first, second = make_pieces(5, "train", 2, 2, scale=0.25, samples=0)
+    whole = make_world(5, "train")
+    at = [clip.episode.meta["synth"]["first_frame"] for clip in (first, second)]
+    middle = whole.num_frames / 2
+    assert at[0] + 2 <= middle <= at[1] <= whole.num_frames - 2
+    assert [c.episode.key for c in (first, second)] == [f"{whole.key}-0", f"{whole.key}-1"]
+    np.testing.assert_array_equal(
+        second.episode.T_camera_from_world, whole.T_camera_from_world[at[1] : at[1] + 2]
+    )
+    size = replace(whole.cut(at[1], 2), image_size_hw=second.episode.image_size_hw)
+    with Renderer(size.image_size_hw, samples=0) as own:
+        again = make_episode(size, own, corruption=None)
+        assert make_episode(size, own, corruption=calm).members != again.members
+    assert again.members == second.members

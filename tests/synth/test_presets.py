@@ -8,6 +8,7 @@ import pytest
 from mint_hub.geometry.hand_state import unpack
 from mint_hub.synth.activities import TRAIN
 from mint_hub.synth.activities_ood import OOD
+from mint_hub.synth.camera_motion import median_steps
 from mint_hub.synth.corruption import Corruption
 from mint_hub.synth.episodes import labels_of
 from mint_hub.synth.frozen import require_frozen
@@ -48,6 +49,19 @@ def test_bench_differs_from_train_in_motion_alone():
         if getattr(train, f.name) != getattr(bench, f.name)
     }
     assert differ == {"name", "stream", "clips", "sway", "least_step"}
+
+
+def test_lively_clips_move_as_the_benches_do_and_are_others():
+    lively, bench = PRESETS["train-lively"], PRESETS["bench"]
+    assert dataclasses.replace(lively, name="", stream=0, clips=0) == dataclasses.replace(
+        bench, name="", stream=0, clips=0
+    )
+    assert len({preset.stream for preset in PRESETS.values()}) == len(PRESETS)
+    world = make_world(seed_of("train-lively", 0, 0), "train-lively")
+    metres, degrees = median_steps(world.T_camera_from_world)
+    assert metres >= 0.006
+    assert degrees >= 0.6
+    assert not is_bench(labels_of(world, None, Corruption()))
 
 
 def test_seeds():
