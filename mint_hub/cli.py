@@ -172,37 +172,27 @@ def _predict(args: argparse.Namespace) -> int:
 def _runner(args: argparse.Namespace) -> "MintRunner":
     import torch
 
-    from mint_hub.assets import default_model
     from mint_hub.geometry.hand_model import HandModel
-    from mint_hub.inference.devices import available_device, available_devices
-    from mint_hub.inference.runner import MintRunner
+    from mint_hub.inference.devices import available_device
+    from mint_hub.inference.opening import open_model, runner_of
     from mint_hub.model.configuration_mint import MintConfig
     from mint_hub.model.loading_mint import cast_weights
     from mint_hub.model.modeling_mint import MintModel
-    from mint_hub.model.processing_mint import MintProcessor
 
     dtypes = {"auto", "float32", "bfloat16", "float16"}
     if args.dtype not in dtypes:
         raise ValueError(f"--dtype: expected one of {sorted(dtypes)}, got {args.dtype!r}")
-    names = args.device.split(",") if args.device else available_devices()[:1]
-    devices = [available_device(name) for name in names]
+    devices = args.device.split(",") if args.device else []
+    for name in devices:
+        available_device(name)
     if args.random_weights:
         torch.manual_seed(0)
         model = MintModel(MintConfig.tiny(name_or_path="random weights, seed 0"))
         if args.dtype != "auto":
             cast_weights(model, getattr(torch, args.dtype))
     else:
-        name = args.model or str(default_model())
-        if name.startswith((".", "/", "~")) and not Path(name).expanduser().is_dir():
-            raise ValueError(f"--model: no such folder: {name}")
-        model = MintModel.from_pretrained(name, dtype=args.dtype, revision=args.revision)
-    import copy
-
-    models = [copy.deepcopy(model) for _ in devices[1:]] + [model]
-    for copied, device in zip(models, devices, strict=True):
-        torch.nn.Module.to(copied.eval(), device)
-    hand_model = HandModel.default(args.mano) if args.mano else None
-    return MintRunner(models, MintProcessor.for_config(model.config), hand_model)
+        model = open_model(args.model, args.dtype, args.revision)
+    return runner_of(model, devices, HandModel.default(args.mano) if args.mano else None)
 
 
 def _number(name: str, text: str) -> float:

@@ -34,24 +34,17 @@ def add_demo(commands: Any) -> None:
 
 
 def _demo(args: argparse.Namespace) -> int:
-    import torch
-
-    from mint_hub.assets import asset_path, default_model, sample_clip
+    from mint_hub.assets import asset_path, sample_clip
     from mint_hub.geometry.additive_metrics import none_for_nan
     from mint_hub.inference.batch import Outputs, failures_text, find_videos, predict_videos
-    from mint_hub.inference.devices import available_devices
-    from mint_hub.inference.runner import MintRunner, RunSettings
+    from mint_hub.inference.opening import open_model, runner_of
+    from mint_hub.inference.runner import RunSettings
     from mint_hub.loaders.atomic import replacing
     from mint_hub.loaders.schema import Episode
-    from mint_hub.model.modeling_mint import MintModel
-    from mint_hub.model.processing_mint import MintProcessor
 
     if args.out.exists() and not args.out.is_dir():
         raise ValueError(f"-o {args.out}: expected a folder, got a file")
-    name = args.model or str(default_model())
-    model = MintModel.from_pretrained(name).eval()
-    torch.nn.Module.to(model, available_devices()[0])
-    runner = MintRunner([model], MintProcessor.for_config(model.config))
+    runner = runner_of(open_model(args.model))
     videos = find_videos([sample_clip()])
     report = predict_videos(
         videos, args.out, runner, RunSettings(), outputs=Outputs(), progress=not args.quiet

@@ -185,18 +185,11 @@ class OpenCheckpoint(OpenPredictor):
 
     @cached_property
     def _runner(self) -> "MintRunner":
-        import torch
-
-        from mint_hub.inference.devices import available_device, available_devices
-        from mint_hub.inference.runner import MintRunner
-        from mint_hub.model.modeling_mint import MintModel
-        from mint_hub.model.processing_mint import MintProcessor
+        from mint_hub.inference.opening import open_model, runner_of
 
         spec = self._spec
-        model = MintModel.from_pretrained(spec.what, dtype=spec.dtype, revision=spec.revision)
-        device = available_device(spec.device or available_devices()[0])
-        torch.nn.Module.to(model.eval(), device)
-        return MintRunner([model], MintProcessor.for_config(model.config), self.hand_model)
+        model = open_model(spec.what, spec.dtype, spec.revision)
+        return runner_of(model, [spec.device] if spec.device else [], self.hand_model)
 
     @cached_property
     def weights_hash(self) -> str:

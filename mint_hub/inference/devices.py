@@ -1,6 +1,12 @@
 """Devices by name, checked before anything is moved there."""
 
+import copy
+from collections.abc import Sequence
+from typing import TypeVar
+
 import torch
+
+ModuleT = TypeVar("ModuleT", bound=torch.nn.Module)
 
 
 def available_device(name: str) -> torch.device:
@@ -29,3 +35,17 @@ def available_devices() -> list[str]:
     if torch.backends.mps.is_available():
         found.append("mps")
     return [*found, "cpu"]
+
+
+def copies_on(model: ModuleT, names: Sequence[str]) -> list[ModuleT]:
+    """Move a network to a device, and copies of it to the others, in the order of their names.
+
+    Raises:
+        ValueError: no such device.
+
+    """
+    devices = [available_device(name) for name in names]
+    copies = [*(copy.deepcopy(model) for _ in devices[1:]), model]
+    for copied, device in zip(copies, devices, strict=True):
+        torch.nn.Module.to(copied, device)
+    return copies

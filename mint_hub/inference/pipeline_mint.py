@@ -5,11 +5,10 @@ from dataclasses import fields
 from os import PathLike
 from typing import Any
 
-import torch
 from transformers.pipelines.base import Pipeline, PipelineRegistry
 from transformers.utils import logging
 
-from mint_hub.inference.devices import available_device
+from mint_hub.inference.devices import copies_on
 from mint_hub.inference.runner import TASK, MintRunner, RunSettings
 from mint_hub.inference.video_input import key_from_name
 from mint_hub.loaders.schema import Episode
@@ -59,7 +58,9 @@ class EgocentricHandsPipeline(SavesCode, Pipeline):
         self.feature_extractor = self.processor.video_processor
         if batch_size is not None:
             self._forward_params["batch_size"] = batch_size
-        self.runner = MintRunner(self._copies(devices), self.processor, hand_model)
+        self.runner = MintRunner(
+            copies_on(self.model, devices) if devices else [self.model], self.processor, hand_model
+        )
 
     def __call__(self, inputs: Any, *args: Any, **kwargs: Any) -> Any:
         """See the class."""
@@ -81,17 +82,6 @@ class EgocentricHandsPipeline(SavesCode, Pipeline):
         """
         self.model.save_pretrained(save_directory, **kwargs)
         self.processor.save_pretrained(save_directory, **kwargs)
-
-    def _copies(self, devices: list[str] | None) -> list[MintModel]:
-        if not devices:
-            return [self.model]
-        import copy
-
-        places = [available_device(name) for name in devices]
-        copies = [copy.deepcopy(self.model).eval() for _ in places]
-        for copied, device in zip(copies, places, strict=True):
-            torch.nn.Module.to(copied, device)
-        return copies
 
     def _sanitize_parameters(self, **parameters: Any) -> tuple[dict[str, Any], ...]:
         if "windows_at_once" in parameters:
