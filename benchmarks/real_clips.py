@@ -35,7 +35,7 @@ def detected(frames: list[NDArray[np.uint8]]) -> Detections:
     """Hands of all frames, each found once."""
     stage = MediaPipeHands()
     try:
-        parts = [stage._detect(frames[at : at + 64], at) for at in range(0, len(frames), 64)]
+        parts = [stage.detect(frames[at : at + 64], at) for at in range(0, len(frames), 64)]
     finally:
         stage.close()
     settings = stage.settings

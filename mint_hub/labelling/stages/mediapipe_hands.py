@@ -83,7 +83,7 @@ class MediaPipeHands:
             NotReadyError: its environment cannot be made.
 
         """
-        parts = [self._detect(images, at) for at, images in self._chunks(clip)]
+        parts = [self.detect(images, at) for at, images in self._chunks(clip)]
         found = without_doubles(
             joined(parts), self.settings.double_distance, self.settings.double_overlap
         )
@@ -96,22 +96,18 @@ class MediaPipeHands:
         }
         return Outcome((reported(clip, report_of(self, **numbers), detections=found),))
 
-    def close(self) -> None:
-        """End the worker."""
-        if self._worker is not None:
-            self._worker.close()
-            self._worker = None
+    def detect(self, images: list[NDArray[np.uint8]], at: int) -> Detections:
+        """Find the hands of frames that follow those of the last call; at 0, a new clip begins.
 
-    def _chunks(self, clip: Clip) -> Iterator[tuple[int, list[NDArray[np.uint8]]]]:
-        """Frames in handfuls, each with the number of its first."""
-        images: list[NDArray[np.uint8]] = []
-        for number, image in enumerate(clip_frames(clip)):
-            images.append(image)
-            if len(images) == _CHUNK or number + 1 == clip.num_frames:
-                yield number + 1 - len(images), images
-                images = []
+        Args:
+            images: RGB (H, W, 3), all of one size.
+            at: number of the first in its clip.
 
-    def _detect(self, images: list[NDArray[np.uint8]], at: int) -> Detections:
+        Raises:
+            StageError: MediaPipe fails on them.
+            NotReadyError: its environment cannot be made.
+
+        """
         settings = self.settings
         if self._worker is None:
             python = python_for(settings.python, ENVIRONMENT)
@@ -128,6 +124,21 @@ class MediaPipeHands:
             complexity=settings.complexity,
         )
         return to_detections(arrays, size_hw, at, settings.tracking_confidence)
+
+    def close(self) -> None:
+        """End the worker."""
+        if self._worker is not None:
+            self._worker.close()
+            self._worker = None
+
+    def _chunks(self, clip: Clip) -> Iterator[tuple[int, list[NDArray[np.uint8]]]]:
+        """Frames in handfuls, each with the number of its first."""
+        images: list[NDArray[np.uint8]] = []
+        for number, image in enumerate(clip_frames(clip)):
+            images.append(image)
+            if len(images) == _CHUNK or number + 1 == clip.num_frames:
+                yield number + 1 - len(images), images
+                images = []
 
 
 def to_detections(
