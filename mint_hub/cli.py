@@ -97,6 +97,7 @@ def _add_predict(commands: Any) -> None:
     add("--window", type=int, help="frames in a window (default: the model's)")
     add("--batch-size", type=int, default=1, help="windows at once (default: 1)")
     add("--smooth", action="store_true", help="smooth the hands (Kalman filter and smoother)")
+    add("--zooms", action="store_true", help="the lens zooms: a field of view of each frame's own")
     add("--presence-threshold", type=float, default=0.0, help="logit from which a hand is there")
     add("--camera", help="known lens: JSON text, or a .json file (K, or model and distortion)")
     add(
@@ -130,6 +131,7 @@ def _predict(args: argparse.Namespace) -> int:
         batch_size=args.batch_size,
         presence_threshold=args.presence_threshold,
         smooth=args.smooth,
+        fixed_lens=not args.zooms,
         on_error=args.on_error,
     )
     options: dict[str, Any] = {}

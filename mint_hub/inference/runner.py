@@ -60,6 +60,8 @@ class RunSettings:
         smooth: smooth the hands ("+ UKF" in the paper's tables), with settings or the defaults.
         chain_over: align windows over "all" frames they share, or the "first" one, as the public
             release does.
+        fixed_lens: the lens does not zoom: the field of view is one for the whole video, the median
+            of what was predicted frame by frame.
         on_error: what damage in the middle of a video does: "raise", or "stop" and keep what came.
 
     """
@@ -71,6 +73,7 @@ class RunSettings:
     presence_threshold: float = 0.0
     smooth: bool | SmoothingSettings = False
     chain_over: Literal["all", "first"] = "all"
+    fixed_lens: bool = True
     on_error: OnError = "raise"
 
     def __post_init__(self) -> None:
@@ -88,6 +91,8 @@ class RunSettings:
             )
         if not isinstance(self.smooth, bool | SmoothingSettings):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise ValueError(f"smooth: expected True, False or settings, got {self.smooth!r}")
+        if not isinstance(self.fixed_lens, bool):  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise ValueError(f"fixed_lens: expected True or False, got {self.fixed_lens!r}")
         for name, values in (("chain_over", ("all", "first")), ("on_error", ("raise", "stop"))):
             if getattr(self, name) not in values:
                 raise ValueError(f"{name}: expected one of {values}, got {getattr(self, name)!r}")
@@ -245,6 +250,8 @@ class MintRunner:
             corrections.append("hands placed under the given focal length")
             if known.rectification is not None:
                 corrections.insert(0, "frames rectified by the given lens")
+        elif settings.fixed_lens:
+            fov = np.broadcast_to(np.median(fov, axis=0), fov.shape)
         if camera_poses is not None:
             T_camera_from_world = poses_at(camera_poses, timestamps)
             corrections.append("predicted camera replaced by the given poses")

@@ -107,6 +107,7 @@ def test_done_is_written_last(runner, clip, tmp_path):
         ({"smooth": "no"}, "smooth"),
         ({"presence_threshold": float("nan")}, "presence_threshold"),
         ({"chain_over": "some"}, "chain_over"),
+        ({"fixed_lens": 1}, "fixed_lens"),
         ({"on_error": "ignore"}, "on_error"),
     ],
 )

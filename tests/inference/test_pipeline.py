@@ -131,6 +131,16 @@ def test_smoothing_and_settings_are_recorded(pipe, clip, episode):
     assert smooth.meta["provenance"]["settings"]["smooth"]["q"] == 0.6
 
 
+def test_a_lens_that_does_not_zoom_has_one_field_of_view(pipe, clip, episode):
+    """The median of the frames' own, which differ; hands are where they were."""
+    each = pipe(clip, fixed_lens=False)
+    assert np.ptp(each.fov_vh_rad, axis=0).min() > 0
+    one = np.median(each.fov_vh_rad, axis=0)
+    np.testing.assert_allclose(episode.fov_vh_rad, np.tile(one, (episode.num_frames, 1)), rtol=1e-6)
+    np.testing.assert_array_equal(each.hand_state, episode.hand_state)
+    assert each.meta["provenance"]["settings"]["fixed_lens"] is False
+
+
 def test_known_camera_is_explicit_in_the_result(pipe, clip, episode):
     height, width = episode.image_size_hw
     K = [[300, 0, width / 2], [0, 310, height / 2], [0, 0, 1]]
