@@ -181,7 +181,7 @@ class MintConfig(PreTrainedConfig):
     @property
     def token_size(self) -> int:
         """Numbers of a patch token: its width, and what motion is seen by, if it is."""
-        return self.hidden_size + ((self.patch_size // 2) ** 2 if self.motion_radius else 0)
+        return self.hidden_size + (self.patch_size**2 if self.motion_radius else 0)
 
     @property
     def num_hand_tokens(self) -> int:

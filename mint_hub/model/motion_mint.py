@@ -1,53 +1,66 @@
 """A cue of motion for small networks: where each patch was in the frame before.
 
-Shape letters: B windows, T frames, N patches of a frame, C width, s half the side of a patch, in
-which patches are compared: pictures at half size.
+Shape letters: B windows, T frames, N patches of a frame, C width, s the side of a patch.
 """
 
 import torch
 from torch import Tensor, nn
 
+from .alignment_mint import Alignment, fit_field, peaks, terms_at
 from .layers_mint import MintMLP, patch_centres
 
 box_mean = nn.functional.avg_pool2d
 
-SURROUND = 7
-"""Side of the square whose mean and spread each pixel is measured by, pixels at half size."""
+SURROUND = 15
+"""Side of the square whose mean and spread each pixel is measured by."""
 SHARPNESS = 8.0
 GAIN = 4.0
 """Of the softmax over differences, and of what it gives."""
-MOMENTS = 18
-"""Six polynomials of two shifts and of how sure they are."""
+SHIFT_UNIT = 8.0
+"""Pixels that count as 1 in what layers are given; no more than MOST of these."""
+MOST = 4.0
+STEPS = (3, 2)
+"""Of the walk to the best field of shifts, at half and at full size."""
+CAMERA_FACTS = 14
+"""Twelve coefficients of the field, how far pixels differ under it, and how many it explains."""
+PATCH_FACTS = 5
+"""The field's shift, what is beyond it, and how well that is seen."""
+
+
+def around(pictures: Tensor, side: int) -> Tensor:
+    """Mean of the square about each pixel, of what of it is in the picture."""
+    for size, edge in (((side, 1), (side // 2, 0)), ((1, side), (0, side // 2))):
+        pictures = box_mean(pictures, size, 1, edge, count_include_pad=False)
+    return pictures
 
 
 def describe(frames: Tensor, patch: int) -> Tensor:
-    """Grey pixels at half size, without local brightness and contrast, patch by patch.
+    """Grey pixels without local brightness and contrast, patch by patch.
 
-    (F, 3, H, W) in [0, 1] -> (F, N, s * s), float32, row by row, s = patch / 2.
+    (F, 3, H, W) in [0, 1] -> (F, N, s * s), float32, row by row.
     """
-    around = {"stride": 1, "padding": SURROUND // 2, "count_include_pad": False}
-    grey = box_mean(frames.float().mean(1, keepdim=True), 2)
-    grey = grey - box_mean(grey, SURROUND, **around)
-    grey = grey / (box_mean(grey.square(), SURROUND, **around) + 1e-4).sqrt()
-    return nn.functional.unfold(grey, patch // 2, stride=patch // 2).mT
+    grey = around(frames.float().mean(1, keepdim=True), 3)
+    grey = grey - around(grey, SURROUND)
+    grey = grey / (around(grey.square(), SURROUND) + 1e-3).sqrt()
+    return nn.functional.unfold(grey, patch, stride=patch).mT
 
 
 class MintMotionCue(nn.Module):
     """Tells patches and the camera token what moved since the frame before.
 
     Each patch learns how alike it is to each nearby place of the frame before: the correlation
-    layer of FlowNet (Dosovitskiy et al. 2015), on pictures instead of features. The camera token
-    learns the moments of the shifts over the picture up to second degree, as the picture of a scene
-    shifts by polynomials of the second degree when a camera turns (Longuet-Higgins and Prazdny
-    1980).
+    layer of FlowNet (Dosovitskiy et al. 2015), on pictures instead of features; and how far it
+    moved, more exactly. The camera token learns the field of shifts of the whole picture, see
+    `alignment_mint`.
     """
 
     def __init__(self, width: int, patch: int, radius: int):
         super().__init__()
-        self.width, self.side, self.radius = width, patch // 2, radius
+        self.width, self.side, self.radius = width, patch, radius
         self.embed = nn.Linear((2 * radius + 1) ** 2, width)
+        self.embed_shift = nn.Linear(PATCH_FACTS, width)
         self.mlp = MintMLP(width, 2 * width, width)
-        self.camera_mlp = MintMLP(MOMENTS, 2 * width, width)
+        self.camera_mlp = MintMLP(CAMERA_FACTS, 2 * width, width)
 
     def forward(self, described: Tensor, grid_hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """(B, T, N, C + s * s), tokens and what `describe` says of them.
@@ -56,45 +69,61 @@ class MintMotionCue(nn.Module):
             Tokens (B, T, N, C) with their cue, and what to add to camera tokens (B, T, 1, C).
         """
         tokens, pixels = described.split([self.width, self.side**2], -1)
-        alike = self.likeness(pixels.float(), grid_hw)
-        cue = self.embed((GAIN * alike).to(tokens.dtype))
-        camera = self.camera_mlp((GAIN * self.moments(alike, grid_hw)).to(tokens.dtype))
+        with torch.no_grad(), torch.autocast(tokens.device.type, enabled=False):
+            now, before = self.pictures(pixels.float(), grid_hw)
+            costs = self.costs(box_mean(now, 2), box_mean(before, 2))
+            moved, patches = self.shifts(now, before, costs, grid_hw)
+        alike = (GAIN * (-SHARPNESS * costs).softmax(-1)).to(tokens.dtype)
+        batch = tokens.shape[:2]
+        cue = self.embed(alike) + self.embed_shift(patches.to(tokens.dtype))
+        cue = cue.unflatten(0, batch)
+        camera = self.camera_mlp(moved.to(tokens.dtype)).unflatten(0, batch)
         return tokens + cue + self.mlp(cue), camera[:, :, None]
 
-    @torch.no_grad()
-    def likeness(self, pixels: Tensor, grid_hw: tuple[int, int]) -> Tensor:
-        """(B, T, N, s * s) -> (B, T, N, shifts), a distribution over shifts.
+    def pictures(self, pixels: Tensor, grid_hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
+        """(B, T, N, s * s) -> frames, and those before them, (B * T, 1, H, W).
 
-        Shift (dy, dx) of the frame before, row by row, each from -radius to radius, at half size.
         The first frame of a window is its own predecessor.
         """
-        batch, frames = pixels.shape[:2]
-        (rows, columns), side, radius = grid_hw, self.side, self.radius
-        size = (rows * side, columns * side)
-        now = nn.functional.fold(pixels.flatten(0, 1).mT, size, side, stride=side)
-        now = now.unflatten(0, (batch, frames))  # (B, T, 1, h, w)
-        before = torch.cat([now[:, :1], now[:, :-1]], 1).flatten(0, 1)
-        now = now.flatten(0, 1)
+        size = (grid_hw[0] * self.side, grid_hw[1] * self.side)
+        now = nn.functional.fold(pixels.flatten(0, 1).mT, size, self.side, stride=self.side)
+        now = now.unflatten(0, pixels.shape[:2])
+        before = torch.cat([now[:, :1], now[:, :-1]], 1)
+        return now.flatten(0, 1), before.flatten(0, 1)
+
+    def costs(self, now: Tensor, before: Tensor) -> Tensor:
+        """How each patch differs from each place near it in the frame before: (F, N, shifts).
+
+        Shifts (dy, dx) row by row, each from -radius to radius, in the pixels of the pictures:
+        those at half size.
+        """
+        (rows, columns), radius, half = now.shape[-2:], self.radius, self.side // 4
         wide = nn.functional.pad(before, (radius,) * 4, mode="replicate")
-        steps, half = range(2 * radius + 1), side // 2
+        steps = range(2 * radius + 1)
         differences = [
-            box_mean((now - wide[..., y : y + size[0], x : x + size[1]]).abs(), half)
+            box_mean((now - wide[..., y : y + rows, x : x + columns]).abs(), half)
             for y in steps
             for x in steps
         ]
         # A square of twice the patch's side about its middle, which is four halves wide.
         differences = box_mean(torch.cat(differences, 1), 4, 2, 1, count_include_pad=False)
-        alike = (-SHARPNESS * differences).softmax(1).flatten(2).mT  # (BT, N, shifts)
-        return alike.unflatten(0, (batch, frames))
+        return differences.flatten(2).mT
 
-    @torch.no_grad()
-    def moments(self, alike: Tensor, grid_hw: tuple[int, int]) -> Tensor:
-        """Moments (B, T, MOMENTS) of mean shifts, and of how sure they are, over the picture."""
-        steps = torch.linspace(-1, 1, 2 * self.radius + 1, device=alike.device)
-        shifts = torch.cartesian_prod(steps, steps)  # (shifts, 2), down and right
-        x, y = patch_centres(grid_hw, alike.device)
-        places = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)  # (N, 6)
-        sure = alike.square().sum(-1, keepdim=True)
-        seen = torch.cat([sure * (alike @ shifts), sure], -1)  # (B, T, N, 3)
-        total = sure.sum(-2, keepdim=True).clamp_min(1e-6)
-        return (seen.mT @ places / total).flatten(-2)
+    def shifts(
+        self, now: Tensor, before: Tensor, costs: Tensor, grid_hw: tuple[int, int]
+    ) -> tuple[Tensor, Tensor]:
+        """Facts for the camera token (F, CAMERA_FACTS), and for patches (F, N, PATCH_FACTS)."""
+        places = patch_centres(grid_hw, now.device)
+        field = fit_field(*peaks(costs, self.radius), places)
+        coarse = Alignment(box_mean(now, 2), box_mean(before, 2))
+        fine = Alignment(now, before)
+        field = fine.refine(2 * coarse.refine(field, STEPS[0]), STEPS[1])
+        beyond, seen, off, explained = fine.local(field, self.side)
+        smooth = terms_at(*places) @ field
+        patches = [_bounded(smooth), _bounded(beyond), seen[..., None] / MOST]
+        moved = [_bounded(field.flatten(1)), torch.stack([off, explained], -1)]
+        return torch.cat(moved, -1), torch.cat(patches, -1)
+
+
+def _bounded(shifts_px: Tensor) -> Tensor:
+    return (shifts_px / SHIFT_UNIT).clamp(-MOST, MOST)

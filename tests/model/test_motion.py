@@ -8,7 +8,7 @@ from mint_hub.geometry.rotations import quat_xyzw_to_matrix
 from mint_hub.inference.network import WindowNetwork
 from mint_hub.model.heads_mint import chained
 from mint_hub.model.modeling_mint import MintModel
-from mint_hub.model.motion_mint import MintMotionCue, describe
+from mint_hub.model.motion_mint import SHIFT_UNIT, MintMotionCue, describe
 from tests.small_model import small_config, small_model
 
 CUE = {"patch_size": 8, "image_size": (48, 64), "motion_radius": 3}
@@ -20,34 +20,63 @@ def texture(seed: int = 0) -> torch.Tensor:
     return torch.nn.functional.avg_pool2d(noise, 5, 1, 2)
 
 
+def compare(cue: MintMotionCue, frames: torch.Tensor) -> torch.Tensor:
+    """Costs (F, N, shifts) of frames of 6 x 8 patches."""
+    now, before = cue.pictures(describe(frames, 8)[None], (6, 8))
+    return cue.costs(half(now), half(before))
+
+
+def half(pictures: torch.Tensor) -> torch.Tensor:
+    return torch.nn.functional.avg_pool2d(pictures, 2)
+
+
+def shifted(down: int, right: int) -> torch.Tensor:
+    """Two frames, the second's content moved by pixels, (2, 3, 48, 64)."""
+    picture = texture()
+    return torch.cat(
+        [picture[..., 16 - dy : 64 - dy, 16 - dx : 80 - dx] for dy, dx in ((0, 0), (down, right))]
+    )
+
+
 @pytest.mark.parametrize(("down", "right"), [(0, 0), (2, 0), (0, -2), (1, 3), (-3, 2)])
 def test_a_shifted_picture_is_found_at_its_shift(down, right):
     """Moved by so many pixels at half size, a patch was that far back in the frame before."""
-    picture = texture()
-    crops = [
-        picture[..., 16 - dy : 64 - dy, 16 - dx : 80 - dx]
-        for dy, dx in ((0, 0), (2 * down, 2 * right))
-    ]
-    cue = MintMotionCue(4, 8, 3)
-    pixels = describe(torch.cat(crops), 8)[None]  # (1, 2, N, 16)
-    found = cue.likeness(pixels, (6, 8))[0, 1].unflatten(0, (6, 8))[1:-1, 1:-1].argmax(-1)
+    costs = compare(MintMotionCue(4, 8, 3), shifted(2 * down, 2 * right))
+    found = costs[1].unflatten(0, (6, 8))[1:-1, 1:-1].argmin(-1)
     assert (found // 7 - 3 == -down).float().mean() > 0.9
     assert (found % 7 - 3 == -right).float().mean() > 0.9
 
 
-def test_likeness_is_a_distribution_and_blind_to_light():
+@pytest.mark.parametrize(("down", "right"), [(0, 0), (3, 0), (-1, 4)])
+def test_the_camera_and_patches_are_told_the_shift(down, right):
+    """Half pixels at half size are pixels: a field without slope or bend, and the same patches."""
+    cue = MintMotionCue(4, 8, 3)
+    frames = shifted(down, right)
+    now, before = cue.pictures(describe(frames, 8)[None], (6, 8))
+    moved, patches = cue.shifts(now, before, compare(cue, frames), (6, 8))
+    back = torch.tensor([-down, -right]) / SHIFT_UNIT
+    torch.testing.assert_close(moved[0, :12], torch.zeros(12), atol=1e-4, rtol=0)
+    torch.testing.assert_close(moved[1, :2], back, atol=0.02, rtol=0)
+    torch.testing.assert_close(moved[1, 2:12], torch.zeros(10), atol=0.03, rtol=0)
+    assert moved[1, 13] > 0.6  # of the pixels
+    middle = patches[1].unflatten(0, (6, 8))[1:-1, 1:-1, :2]
+    torch.testing.assert_close(middle, back.expand_as(middle), atol=0.03, rtol=0)
+
+
+def test_costs_are_blind_to_light():
     cue, frames = MintMotionCue(4, 8, 2), torch.cat([texture(1), texture(2)])[..., :48, :64]
-    pixels = describe(frames, 8)[None]
-    alike = cue.likeness(pixels, (6, 8))
-    assert alike.shape == (1, 2, 48, 25)
-    torch.testing.assert_close(alike.sum(-1), torch.ones(1, 2, 48))
-    darker = describe(0.6 * frames + 0.2, 8)[None]
-    torch.testing.assert_close(cue.likeness(darker, (6, 8)), alike, atol=0.05, rtol=0)
+    frames = (6 * (frames - 0.5) + 0.5).clamp(0, 1)  # as much contrast as real pictures have
+    costs = compare(cue, frames)
+    assert costs.shape == (2, 48, 25)
+    darker = compare(cue, 0.6 * frames + 0.2)
+    torch.testing.assert_close(darker, costs, atol=0.01, rtol=0.1)
+    assert costs[1].mean() > 0.5
 
 
 def test_the_first_frame_does_not_move():
-    cue, pixels = MintMotionCue(4, 8, 2), describe(texture()[..., :48, :64], 8)[None]
-    assert (cue.likeness(pixels, (6, 8)).argmax(-1) == 12).all()  # the middle of 5 x 5
+    costs = compare(MintMotionCue(4, 8, 2), texture()[..., :48, :64])
+    assert (costs.argmin(-1) == 12).all()  # the middle of 5 x 5
+    assert (costs[..., 12] == 0).all()
 
 
 def test_windows_from_cached_tokens_are_windows_from_pixels():
@@ -108,12 +137,3 @@ def test_a_chained_window_begins_at_the_identity():
     start = torch.tensor([0, 0, 0, 0, 0, 0, 1.0]).expand(2, 7)
     torch.testing.assert_close(pose[:, 0, :7], start, rtol=0, atol=0)
     assert (pose[:, 1:, :3].abs().sum(-1) > 0).all()
-
-
-def test_a_turn_of_the_camera_shows_in_the_moments():
-    """Every patch shifted alike: the mean shift is that shift, and nothing bends."""
-    cue, alike = MintMotionCue(4, 8, 2), torch.zeros(1, 1, 48, 25)
-    alike[..., 4 * 5 + 1] = 1  # two down, one left
-    moments = cue.moments(alike, (6, 8)).unflatten(-1, (3, 6))[0, 0]
-    torch.testing.assert_close(moments[:, 0], torch.tensor([1.0, -0.5, 1.0]))
-    torch.testing.assert_close(moments[:, 1:3], torch.zeros(3, 2), atol=1e-6, rtol=0)
