@@ -29,8 +29,9 @@ import numpy as np
 from _report import write_report
 
 from mint_hub.loaders.clips import PackedClip
+from mint_hub.synth.corpus import synthesise
 from mint_hub.synth.corruption import Corruption, corrupt, encode
-from mint_hub.synth.episodes import make_clip, make_episode, synthesise
+from mint_hub.synth.episodes import make_clip, make_episode
 from mint_hub.synth.presets import seed_of
 from mint_hub.synth.render import PASSES, Rendered, Renderer
 from mint_hub.synth.scene import make_world

@@ -12,8 +12,9 @@ from mint_hub.geometry.camera import fov_vh_to_K
 from mint_hub.geometry.hand_model import HandModel
 from mint_hub.geometry.lenses import KannalaBrandtLens, Lens, OpenCVLens, rectification
 from mint_hub.loaders.clips import decode_window
+from mint_hub.synth.corpus import synthesise
 from mint_hub.synth.corruption import Corruption, corrupt, covering_fov
-from mint_hub.synth.episodes import DEPTH_STEP_M, make_clip, make_episode, presence_of, synthesise
+from mint_hub.synth.episodes import DEPTH_STEP_M, make_clip, make_episode, presence_of
 from mint_hub.synth.lensing import TALLEST_RAD, Bend, draw_lens, pinhole_of, seen_through
 from mint_hub.synth.presets import fingerprint, is_bench
 from mint_hub.synth.render import Renderer
