@@ -66,6 +66,8 @@ def _train(args: argparse.Namespace) -> int:
         raise ImportError("training needs accelerate: pip install 'mint-hub[train]'") from None
     del _accelerate
 
+    from torch import distributed
+
     from mint_hub.synth.teacher_noise import TeacherNoise
     from mint_hub.training.run import Request, train
     from mint_hub.training.trainer import Pace
@@ -101,6 +103,9 @@ def _train(args: argparse.Namespace) -> int:
         compile=args.compile,
     )
     report = train(request)
+    if distributed.is_available() and distributed.is_initialized():
+        # Left to the interpreter's end, its threads now and then abort a process that is done.
+        distributed.destroy_process_group()
     if int(os.environ.get("RANK", "0")) > 0:  # the first process says it for all
         return 0
     for warning in report.warnings:
