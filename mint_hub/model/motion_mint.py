@@ -70,9 +70,10 @@ class MintMotionCue(nn.Module):
         """
         tokens, pixels = described.split([self.width, self.side**2], -1)
         with torch.no_grad(), torch.autocast(tokens.device.type, enabled=False):
-            now, before = self.pictures(pixels.float(), grid_hw)
-            costs = self.costs(box_mean(now, 2), box_mean(before, 2))
-            moved, patches = self.shifts(now, before, costs, grid_hw)
+            whole = self.pictures(pixels.float(), grid_hw)
+            half = (box_mean(whole[0], 2), box_mean(whole[1], 2))
+            costs = self.costs(*half)
+            moved, patches = self.shifts(Alignment(*whole), Alignment(*half), costs, grid_hw)
         alike = (GAIN * (-SHARPNESS * costs).softmax(-1)).to(tokens.dtype)
         batch = tokens.shape[:2]
         cue = self.embed(alike) + self.embed_shift(patches.to(tokens.dtype))
@@ -110,15 +111,13 @@ class MintMotionCue(nn.Module):
         return differences.flatten(2).mT
 
     def shifts(
-        self, now: Tensor, before: Tensor, costs: Tensor, grid_hw: tuple[int, int]
+        self, whole: Alignment, half: Alignment, costs: Tensor, grid_hw: tuple[int, int]
     ) -> tuple[Tensor, Tensor]:
         """Facts for the camera token (F, CAMERA_FACTS), and for patches (F, N, PATCH_FACTS)."""
-        places = patch_centres(grid_hw, now.device)
+        places = patch_centres(grid_hw, costs.device)
         field = fit_field(*peaks(costs, self.radius), places)
-        coarse = Alignment(box_mean(now, 2), box_mean(before, 2))
-        fine = Alignment(now, before)
-        field = fine.refine(2 * coarse.refine(field, STEPS[0]), STEPS[1])
-        beyond, seen, off, explained = fine.local(field, self.side)
+        field = whole.refine(2 * half.refine(field, STEPS[0]), STEPS[1])
+        beyond, seen, off, explained = whole.local(field, self.side)
         smooth = terms_at(*places) @ field
         patches = [_bounded(smooth), _bounded(beyond), seen[..., None] / MOST]
         moved = [_bounded(field.flatten(1)), torch.stack([off, explained], -1)]

@@ -6,6 +6,7 @@ from huggingface_hub.errors import StrictDataclassError
 
 from mint_hub.geometry.rotations import quat_xyzw_to_matrix
 from mint_hub.inference.network import WindowNetwork
+from mint_hub.model.alignment_mint import Alignment
 from mint_hub.model.heads_mint import chained
 from mint_hub.model.modeling_mint import MintModel
 from mint_hub.model.motion_mint import SHIFT_UNIT, MintMotionCue, describe
@@ -53,7 +54,8 @@ def test_the_camera_and_patches_are_told_the_shift(down, right):
     cue = MintMotionCue(4, 8, 3)
     frames = shifted(down, right)
     now, before = cue.pictures(describe(frames, 8)[None], (6, 8))
-    moved, patches = cue.shifts(now, before, compare(cue, frames), (6, 8))
+    fields = Alignment(now, before), Alignment(half(now), half(before))
+    moved, patches = cue.shifts(*fields, compare(cue, frames), (6, 8))
     back = torch.tensor([-down, -right]) / SHIFT_UNIT
     torch.testing.assert_close(moved[0, :12], torch.zeros(12), atol=1e-4, rtol=0)
     torch.testing.assert_close(moved[1, :2], back, atol=0.02, rtol=0)
