@@ -23,7 +23,7 @@ from typing import Final
 import numpy as np
 
 from mint_hub.conventions import JOINT_NAMES, LEFT_MIRROR, Side
-from mint_hub.geometry.arrays import Array, namespace, require_shape
+from mint_hub.geometry.arrays import Array, ArrayT, namespace, require_shape
 from mint_hub.geometry.rotations import matrix_to_rot6d_rows, rot6d_rows_to_matrix
 
 NUM_JOINT_ROTATIONS: Final = len(JOINT_NAMES) - 1
@@ -189,3 +189,23 @@ def mirror_rotations(rotations: Array) -> Array:
     if isinstance(rotations, np.ndarray):
         return rotations * signs.astype(rotations.dtype)
     return rotations * rotations.new_tensor(signs)
+
+
+def keep_in_picture(hand_state: ArrayT, fov_vh_before: Array, fov_vh_after: Array) -> ArrayT:
+    """Hands where they lay in the picture and as deep, under another field of view.
+
+    x' = x tan(after / 2) / tan(before / 2), of horizontal angles; y alike, of vertical ones.
+
+    Args:
+        hand_state: (..., 2, 109), camera frame, metres.
+        fov_vh_before: (..., 2) radians, (vertical, horizontal), that the hands were placed under.
+        fov_vh_after: (..., 2) radians.
+
+    Returns:
+        (..., 2, 109): only x and y of translations differ.
+
+    """
+    xp = namespace(hand_state)
+    ratio = xp.tan(fov_vh_after / 2) / xp.tan(fov_vh_before / 2)
+    xy = hand_state[..., :2] * ratio[..., None, [1, 0]]
+    return xp.concatenate([xy, hand_state[..., 2:]], -1)

@@ -78,15 +78,10 @@ def correct_translation(
         (T, 2, 109): only translations differ.
 
     """
-    ratio_yx = np.tan(fov_predicted / 2) / np.tan(
-        np.broadcast_to(fov_true, fov_predicted.shape) / 2
-    )
-    ratio_xy = ratio_yx[:, None, ::-1]  # (T, 1, 2)
-    depth = np.sqrt(ratio_xy.prod(-1, keepdims=True))
-    corrected = hand_state.copy()
-    translation = corrected[..., hands.TRANSLATION]
-    translation[..., :2] *= depth / ratio_xy
-    translation[..., 2:] *= depth
+    fov_true = np.broadcast_to(fov_true, fov_predicted.shape)
+    ratio = np.tan(fov_predicted / 2) / np.tan(fov_true / 2)
+    corrected = hands.keep_in_picture(hand_state, fov_predicted, fov_true)
+    corrected[..., hands.TRANSLATION] *= np.sqrt(ratio.prod(-1))[:, None, None]
     return corrected
 
 

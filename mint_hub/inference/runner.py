@@ -251,7 +251,8 @@ class MintRunner:
             if known.rectification is not None:
                 corrections.insert(0, "frames rectified by the given lens")
         elif settings.fixed_lens:
-            fov = np.broadcast_to(np.median(fov, axis=0), fov.shape)
+            median = np.broadcast_to(np.median(fov, axis=0), fov.shape)
+            state, fov = hands.keep_in_picture(state, fov, median), median
         if camera_poses is not None:
             T_camera_from_world = poses_at(camera_poses, timestamps)
             corrections.append("predicted camera replaced by the given poses")

@@ -41,6 +41,9 @@ class MintConfig(PreTrainedConfig):
         camera_relative_to: what the camera head's numbers of a frame mean: its pose relative to the
             window's "first" frame, as in the release, or its motion since the "previous" one, which
             are chained into poses: small networks then need not add up a window's motion.
+        camera_refinement: what becomes of the camera head's path: "none", as in the release, or
+            "pictures": it is made exact by laying the window's pictures over each other
+            (`refine_path`), as small networks learn geometry badly. Needs a motion_radius.
         camera_output_scale: what the camera head's last layer is multiplied by. A camera moves by
             millimetres a frame: below 1, steps of training are as fine, and its gradients do not
             drown the hands' in what both share, where nothing was learned before.
@@ -87,6 +90,7 @@ class MintConfig(PreTrainedConfig):
     camera_heads: int = 16
     camera_iterations: int = 4
     camera_relative_to: Literal["first", "previous"] = "first"
+    camera_refinement: Literal["none", "pictures"] = "none"
     camera_output_scale: float = 1.0
     fov_hidden_size: int = 512
     fov_heads: int = 8
@@ -155,6 +159,10 @@ class MintConfig(PreTrainedConfig):
                     f"{width}: expected a multiple of {heads}={getattr(self, heads)}{extra}, "
                     f"got {getattr(self, width)}"
                 )
+        if self.camera_refinement == "pictures" and not self.motion_radius:
+            raise ValueError(
+                'motion_radius: expected at least 1 with camera_refinement "pictures", got 0'
+            )
         if not self.camera_output_scale > 0:
             raise ValueError(
                 f"camera_output_scale: expected more than 0, got {self.camera_output_scale}"

@@ -13,10 +13,18 @@ from ..geometry.hand_state import HAND_STATE_SIZE, HandState
 from ..geometry.rotations import matrix_to_quat_xyzw, quat_xyzw_to_matrix, rotvec_to_matrix
 from .configuration_mint import MintConfig
 from .crop_mint import mirror_signs
+from .egomotion_mint import Belief, refine_path
 from .layers_mint import MintCrossAttention, MintLayer, MintMLP
 
 POSE_SIZE = 7
 MAX_ROTATION_STEP = math.radians(30.0)
+BELIEF = (math.radians(0.6), 0.004, 2.5, 0.75, 0.08)
+"""Of a camera head's path, as long as nothing else was learned: a motion's turn (radians) and
+length (metres) may be off by so much; patches are so near (1 / metres), on average, and that may be
+off by so much."""
+MAX_LOG_BELIEF = 2.0
+INITIAL_TRUST = -2.0
+"""Logit."""
 INITIAL_FOV_VH_DEG = (60.0, 75.0)
 INITIAL_WRIST_M = (0.0, 0.0, 0.4)  # an arm's length before the camera
 HAND_PARTS = {"translation": (3, 3), "orientation": (6, 3), "pose": (90, 45), "shape": (10, 10)}
@@ -80,6 +88,11 @@ class MintCameraHead(nn.Module):
         )
         self.layers_norm = nn.LayerNorm(width)
         self.pose_mlp = MintMLP(width, width // 2, POSE_SIZE)
+        self.refinement = (
+            MintPathRefinement(width, config.patch_size)
+            if config.camera_refinement == "pictures"
+            else None
+        )
 
     def forward(self, camera_tokens: Tensor, implementation: str) -> tuple[Tensor, ...]:
         """(B, T, W) -> per iteration (B, T, 7): translation 3 (metres), quaternion xyzw 4 (raw)."""
@@ -97,6 +110,46 @@ class MintCameraHead(nn.Module):
                 step = self.pose_mlp(self.layers_norm(x)) * self.output_scale
                 poses.append(poses[-1] + step if poses else step)
             return tuple(chained(pose) for pose in poses) if self.chains else tuple(poses)
+
+
+class MintPathRefinement(nn.Module):
+    """Makes a path exact by its pictures, and learns what of them to believe.
+
+    Which patches stand still, how far the path may be off, and how near things are; weights for
+    bundle adjustment are learned through it as in DROID-SLAM (Teed and Deng 2021).
+    """
+
+    def __init__(self, width: int, patch: int):
+        super().__init__()
+        self.patch = patch
+        self.patch_norm = nn.LayerNorm(width)
+        self.trust = MintMLP(width, width // 4, 1)
+        self.camera_norm = nn.LayerNorm(width)
+        self.belief = nn.Linear(width, len(BELIEF))
+
+    def forward(self, pose: Tensor, fov_vh: Tensor, tokens: Tensor, pictures: Tensor) -> Tensor:
+        """Refine windows.
+
+        Args:
+            pose: (B, T, 7), as of the camera head.
+            fov_vh: (B, T, 2) radians; one lens a window, their mean.
+            tokens: (B, T, 1 + N, W), the camera's and the patches'.
+            pictures: (B, T, 1, H, W), as of `describe`.
+
+        Returns:
+            Poses (B, T, 7).
+        """
+        with torch.autocast(tokens.device.type, enabled=False):
+            tokens = tokens.to(self.belief.weight.dtype)
+            middle = tokens[:, tokens.shape[1] // 2, 1:]
+            trust = self.trust(self.patch_norm(middle))[..., 0].sigmoid()
+            told = self.belief(self.camera_norm(tokens[:, :, 0]).mean(1))
+            told = (MAX_LOG_BELIEF * torch.tanh(told / MAX_LOG_BELIEF)).exp()
+            spreads = [usual * ratio for usual, ratio in zip(BELIEF, told.unbind(-1), strict=True)]
+            R = quat_xyzw_to_matrix(pose[..., 3:], check=False)
+            belief = Belief(R, pose[..., :3], *spreads, trust, fov_vh.float().mean(1))
+            R, t, fov = refine_path(pictures, belief, self.patch)
+            return torch.cat([t, matrix_to_quat_xyzw(R)], -1), fov
 
 
 class MintFovOutput(nn.Linear):

@@ -25,16 +25,19 @@ from transformers.utils.generic import can_return_tuple, merge_with_config_defau
 from transformers.utils.output_capturing import OutputRecorder, capture_outputs
 
 from ..geometry.hand_model import HandModel
+from ..geometry.hand_state import keep_in_picture
 from .configuration_mint import MintConfig
 from .conversion_mint import load_lingbot, register_conversion
 from .crop_mint import Crops, MintHandCrops
 from .heads_mint import (
     INITIAL_FOV_VH_DEG,
+    INITIAL_TRUST,
     INITIAL_WRIST_M,
     MintCameraHead,
     MintFovHead,
     MintFovOutput,
     MintHandHead,
+    MintPathRefinement,
     MintPresenceHead,
 )
 from .layers_mint import (
@@ -221,6 +224,13 @@ class MintAggregator(nn.Module):
             x = global_layer(within, implementation, rotary)
         return torch.cat([within, x], -1)
 
+    def pictures(self, patches: Tensor, grid_hw: tuple[int, int]) -> Tensor:
+        """What `describe` said of windows (B, T, N, token size), as pictures (B, T, 1, H, W)."""
+        assert self.motion_cue is not None  # the configuration sees to it
+        count, width = grid_hw[0] * grid_hw[1], self.camera_token.shape[-1]
+        with torch.no_grad():
+            return self.motion_cue.pictures(patches[:, :, :count, width:], grid_hw)
+
 
 class MintPreTrainedModel(SavesCode, PreTrainedModel):
     """Loading, saving and initialisation shared by MINT models."""
@@ -310,6 +320,13 @@ class MintPreTrainedModel(SavesCode, PreTrainedModel):
         else:
             self._init_head(module, std)
 
+    def _init_refinement(self, module: MintPathRefinement) -> None:
+        """All patches are trusted alike, and the path as much as `BELIEF` says."""
+        init.zeros_(module.belief.weight)
+        init.zeros_(module.belief.bias)
+        init.zeros_(module.trust.fc2.weight)
+        init.constant_(module.trust.fc2.bias, INITIAL_TRUST)
+
     def _init_head(self, module: nn.Module, std: float) -> None:
         """Heads start near a sensible answer: identity rotations, no motion, no increments.
 
@@ -325,6 +342,8 @@ class MintPreTrainedModel(SavesCode, PreTrainedModel):
             # The iterations add up to w = 1.
             bias[6] = 1.0 / (module.iterations * module.output_scale)
             init.copy_(module.pose_mlp.fc2.bias, bias)
+            if module.refinement is not None:
+                self._init_refinement(module.refinement)
         elif isinstance(module, MintHandHead):
             init.normal_(module.queries, std=std)
             init.zeros_(module.empty_state)
@@ -378,6 +397,26 @@ class MintModel(MintPreTrainedModel):
         model = cls(config or MintConfig.full())
         load_lingbot(model, path)
         return model
+
+    def refine_by_pictures(self) -> None:
+        """From here on, make the camera head's path exact by pictures (`camera_refinement`).
+
+        Raises:
+            ValueError: a network whose patch tokens do not carry pixels: its motion_radius is 0.
+        """
+        if self.camera_head.refinement is not None:
+            return
+        if not self.config.motion_radius:
+            raise ValueError(
+                "camera refinement: expected a network with a motion_radius of at least 1, got 0"
+            )
+        self.config.camera_refinement = "pictures"
+        width, patch = 2 * self.config.hidden_size, self.config.patch_size
+        refinement = MintPathRefinement(width, patch).to(self.device)
+        for module in refinement.modules():
+            self._init_weights(module)
+        self._init_refinement(refinement)
+        self.camera_head.refinement = refinement
 
     def get_input_embeddings(self) -> nn.Module:
         """The convolution that embeds patches."""
@@ -464,9 +503,17 @@ class MintModel(MintPreTrainedModel):
         camera_tokens = tokens[:, :, 0]
         poses = self.camera_head(camera_tokens, implementation)
         fov = self.fov_head(camera_tokens, implementation)
+        fov_before = None
+        if self.camera_head.refinement is not None:
+            pictures = self.aggregator.pictures(patch_tokens, grid_hw)
+            seen = torch.cat([tokens[:, :, :1], tokens[:, :, self.config.num_special_tokens :]], 2)
+            refined, lens = self.camera_head.refinement(poses[-1], fov, seen, pictures)
+            poses, fov_before, fov = (*poses, refined), fov, lens[:, None].expand_as(fov)
         wanted = labels is not None and self.loss_settings.weights.get(ATTENTION_TERM, 0) > 0
         looks: list[Tensor] | None = [] if wanted else None
         hands = self.hand_head(tokens, implementation, looks)
+        if fov_before is not None:
+            hands = tuple(keep_in_picture(hand, fov_before, fov) for hand in hands)
         presence = self.presence_head(
             tokens[:, :, self.config.num_special_tokens :], implementation, looks
         )

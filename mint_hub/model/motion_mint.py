@@ -70,7 +70,10 @@ class MintMotionCue(nn.Module):
         """
         tokens, pixels = described.split([self.width, self.side**2], -1)
         with torch.no_grad(), torch.autocast(tokens.device.type, enabled=False):
-            whole = self.pictures(pixels.float(), grid_hw)
+            pictures = self.pictures(pixels, grid_hw)
+            # The first frame of a window is its own predecessor.
+            before = torch.cat([pictures[:, :1], pictures[:, :-1]], 1)
+            whole = pictures.flatten(0, 1), before.flatten(0, 1)
             half = (box_mean(whole[0], 2), box_mean(whole[1], 2))
             costs = self.costs(*half)
             moved, patches = self.shifts(Alignment(*whole), Alignment(*half), costs, grid_hw)
@@ -81,16 +84,12 @@ class MintMotionCue(nn.Module):
         camera = self.camera_mlp(moved.to(tokens.dtype)).unflatten(0, batch)
         return tokens + cue + self.mlp(cue), camera[:, :, None]
 
-    def pictures(self, pixels: Tensor, grid_hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
-        """(B, T, N, s * s) -> frames, and those before them, (B * T, 1, H, W).
-
-        The first frame of a window is its own predecessor.
-        """
+    def pictures(self, pixels: Tensor, grid_hw: tuple[int, int]) -> Tensor:
+        """What `describe` said of patches, (B, T, N, s * s) -> as pictures (B, T, 1, H, W)."""
         size = (grid_hw[0] * self.side, grid_hw[1] * self.side)
-        now = nn.functional.fold(pixels.flatten(0, 1).mT, size, self.side, stride=self.side)
-        now = now.unflatten(0, pixels.shape[:2])
-        before = torch.cat([now[:, :1], now[:, :-1]], 1)
-        return now.flatten(0, 1), before.flatten(0, 1)
+        patches = pixels.float().flatten(0, 1).mT
+        now = nn.functional.fold(patches, size, self.side, stride=self.side)
+        return now.unflatten(0, pixels.shape[:2])
 
     def costs(self, now: Tensor, before: Tensor) -> Tensor:
         """How each patch differs from each place near it in the frame before: (F, N, shifts).

@@ -105,6 +105,7 @@ class Recipe:
         sources: "one" refuses data of several sources.
         augment: change the colours of windows at random.
         views: mirror, crop, turn, hasten and reverse windows at random, labels alike.
+        refine: from here on, the camera head's path is made exact by pictures.
 
     Raises:
         ValueError: a number out of range, an unknown part, or nothing to train.
@@ -124,6 +125,7 @@ class Recipe:
     sources: Sources = "all"
     augment: bool = False
     views: bool = False
+    refine: bool = False
 
     def __post_init__(self) -> None:
         for name in ("batch", "window", "stride"):
@@ -219,6 +221,7 @@ OPTIONS: Final[Mapping[str, Callable[[Recipe], Recipe]]] = MappingProxyType(
         "visible": lambda given: replace(given, presence="visible"),
         "augment": lambda given: replace(given, augment=True),
         "views": lambda given: replace(given, views=True),
+        "refine": lambda given: replace(given, refine=True),
         "even": lambda given: replace(given, learning_rates=_RATES_EVEN),
         "scratch": lambda given: replace(given, init="random", learning_rates=_RATES_EVEN),
         "fp32": lambda given: replace(given, optimisation=replace(given.optimisation, bf16=False)),
@@ -228,7 +231,8 @@ OPTIONS: Final[Mapping[str, Callable[[Recipe], Recipe]]] = MappingProxyType(
 motion (camera terms weigh as much as the hands': see `losses_mint.MOTION`), guide (attention is
 drawn to the hands: see `losses_mint.GUIDE`), no-image, random and pretrained (what to begin with),
 one-source, visible (presence learns the visible share of a hand), augment (colours), views (windows
-mirrored, cropped, turned, faster, backwards), even (one learning rate for all parts, 5e-4), scratch
+mirrored, cropped, turned, faster, backwards), refine (the camera head's path is made exact by
+pictures: see `MintConfig.camera_refinement`), even (one learning rate for all parts, 5e-4), scratch
 (random and even: nothing is known yet that a lower rate would keep), fp32 (no autocast)."""
 
 

@@ -149,7 +149,10 @@ def train(request: Request) -> Report:
         **({"fsdp": True, "fsdp_config": {"version": 2}} if request.fsdp else {}),
     )
     config = _config(request, checkpoint)
-    config.window = request.recipe.window
+    config.window, refined_before = request.recipe.window, config.camera_refinement
+    if request.recipe.refine:
+        config.camera_refinement = "pictures"
+        config.validate_architecture()
     windows = _windows(request, config, out)
     _check_windows(request, config, windows)
     facts = _facts(request, config, windows)
@@ -161,7 +164,7 @@ def train(request: Request) -> Report:
     if done.is_dir() and checkpoint is not None and _step(checkpoint) >= request.pace.steps:
         return Report(done, _step(checkpoint), _step(checkpoint), read_log(out), windows.warnings)
     set_seed(request.recipe.optimisation.seed)
-    model = MintModel(config) if checkpoint is not None else _model(request, config)
+    model = MintModel(config) if checkpoint is not None else _model(request, config, refined_before)
     model.set_attn_implementation(request.attention)
     if request.compile:
         compile_layers(model)
@@ -234,12 +237,16 @@ def _config(request: Request, checkpoint: Path | None) -> MintConfig:
     return MintConfig.from_pretrained(request.init)
 
 
-def _model(request: Request, config: MintConfig) -> MintModel:
+def _model(request: Request, config: MintConfig, refined_before: str) -> MintModel:
     if request.init == "random":
         return MintModel(config)
     if request.init.endswith(".pt"):
         return MintModel.from_lingbot_map(request.init, config)
-    return MintModel.from_pretrained(request.init, config=config, dtype=torch.float32)
+    config.camera_refinement = refined_before  # as the weights are
+    model = MintModel.from_pretrained(request.init, config=config, dtype=torch.float32)
+    if request.recipe.refine:
+        model.refine_by_pictures()
+    return model
 
 
 def _settings(request: Request) -> WindowSettings:
@@ -321,6 +328,7 @@ def _facts(request: Request, config: MintConfig, windows: TrainingWindows) -> di
         "window": recipe.window,
         "stride": recipe.stride,
         "presence": recipe.presence,
+        "refine": recipe.refine,
         "optimisation": asdict(recipe.optimisation),
         "steps": request.pace.steps,
         "init": request.init,

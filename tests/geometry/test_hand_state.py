@@ -10,6 +10,7 @@ from mint_hub.geometry.hand_state import (
     HAND_STATE_SIZE,
     HandState,
     absent,
+    keep_in_picture,
     mirror_rotations,
     unpack,
 )
@@ -100,3 +101,17 @@ def test_zero_rotation_rows_raise_unless_unchecked():
     with pytest.raises(ValueError, match="rot6d"):
         state.orientation()
     assert np.isfinite(state.joint_rotations(check=False)).all()
+
+
+def test_hands_keep_their_place_in_the_picture_under_another_view():
+    """Pixels and depths stay; there and back again is where they were."""
+    before, after = np.array([[1.0, 1.3]]), np.array([[0.8, 1.1]])
+    hands = np.random.default_rng(3).normal(size=(4, 2, HAND_STATE_SIZE))
+    moved = keep_in_picture(hands, before, after)
+    for axis, angle in ((0, 1), (1, 0)):
+        slope = [np.tan(fov[0, angle] / 2) for fov in (before, after)]
+        assert_allclose(hands[..., axis] / slope[0], moved[..., axis] / slope[1])
+    assert_array_equal(moved[..., 2:], hands[..., 2:])
+    assert_allclose(keep_in_picture(moved, after, before), hands, rtol=1e-6)
+    of_torch = keep_in_picture(*map(torch.from_numpy, (hands, before, after)))
+    assert_allclose(of_torch.numpy(), moved, rtol=1e-6)

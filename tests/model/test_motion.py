@@ -23,8 +23,14 @@ def texture(seed: int = 0) -> torch.Tensor:
 
 def compare(cue: MintMotionCue, frames: torch.Tensor) -> torch.Tensor:
     """Costs (F, N, shifts) of frames of 6 x 8 patches."""
-    now, before = cue.pictures(describe(frames, 8)[None], (6, 8))
+    now, before = now_and_before(cue, frames)
     return cue.costs(half(now), half(before))
+
+
+def now_and_before(cue: MintMotionCue, frames: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Frames as the cue sees them; the first is its own predecessor."""
+    now = cue.pictures(describe(frames, 8)[None], (6, 8))[0]
+    return now, torch.cat([now[:1], now[:-1]])
 
 
 def half(pictures: torch.Tensor) -> torch.Tensor:
@@ -53,7 +59,7 @@ def test_the_camera_and_patches_are_told_the_shift(down, right):
     """Half pixels at half size are pixels: a field without slope or bend, and the same patches."""
     cue = MintMotionCue(4, 8, 3)
     frames = shifted(down, right)
-    now, before = cue.pictures(describe(frames, 8)[None], (6, 8))
+    now, before = now_and_before(cue, frames)
     fields = Alignment(now, before), Alignment(half(now), half(before))
     moved, patches = cue.shifts(*fields, compare(cue, frames), (6, 8))
     back = torch.tensor([-down, -right]) / SHIFT_UNIT

@@ -164,6 +164,35 @@ def test_stage_2_leaves_every_other_tensor_bit_equal(trained, corpus, tmp_path):
     assert not any(name.startswith("hand/") for name in report.log[0])
 
 
+def test_stage_2_refines_by_pictures_from_here_on(trained, corpus, tmp_path):
+    """What refines is new, trained, saved and gone on with; the rest of stage 2 is as ever."""
+    seeing = {"patch_size": 8, "image_size": (32, 48), "motion_radius": 2}
+    sizes = type(config())(**(config().to_dict() | seeing))
+    one = {"pace": Pace(1, log_every=1), "config": sizes}
+    first = train(request(corpus, tmp_path / "one", **one))
+    second = {"recipe": small("stage2+refine", batch=2), "init": str(first.model), "config": None}
+    whole = train(request(corpus, tmp_path / "two", **second))
+    loaded = MintModel.from_pretrained(whole.model)
+    assert loaded.config.camera_refinement == "pictures"
+    before, after = weights(first.model), loaded.state_dict()
+    new = set(after) - set(before)
+    assert new
+    assert all(name.startswith("camera_head.refinement.") for name in new)
+    assert after["camera_head.refinement.belief.bias"].any()
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert changed
+    assert all(name.startswith("camera_head.") for name in changed)
+    for name in ("model", f"checkpoint-{STEPS}"):
+        shutil.rmtree(tmp_path / "two" / name)
+    again = train(request(corpus, tmp_path / "two", **second))
+    assert again.resumed_from == 2
+    assert losses(again) == losses(whole)
+    blind = second | {"init": str(trained.model)}
+    with pytest.raises(ValueError, match="motion_radius: expected at least 1"):
+        train(request(corpus, tmp_path / "blind", **blind))
+    assert not (tmp_path / "blind").exists()
+
+
 def test_stage_2_needs_a_stage_1_network(corpus, tmp_path):
     with pytest.raises(ValueError, match=r"stage 1 network.*got 'random'"):
         train(request(corpus, tmp_path / "run", recipe=small("stage2")))

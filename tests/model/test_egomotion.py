@@ -1,0 +1,261 @@
+"""The camera's path made exact by pictures: in scenes drawn exactly, whatever else moves."""
+
+import pytest
+import torch
+from huggingface_hub.errors import StrictDataclassError
+
+from mint_hub.geometry.rotations import geodesic_angle, rotvec_to_matrix
+from mint_hub.model.egomotion_mint import Belief, refine_path
+from mint_hub.model.heads_mint import BELIEF
+from mint_hub.model.layers_mint import patch_centres
+from mint_hub.model.modeling_mint import MintModel
+from tests.small_model import small_config, small_model
+
+SIZE = (96, 128)
+PATCH = 4
+GRID = (SIZE[0] // PATCH, SIZE[1] // PATCH)
+PATCHES = GRID[0] * GRID[1]
+FOV_VH = torch.tensor([1.1, 1.3])
+REFINED = {
+    "patch_size": 8,
+    "image_size": (48, 64),
+    "motion_radius": 3,
+    "camera_refinement": "pictures",
+}
+Poses = tuple[torch.Tensor, torch.Tensor]
+
+
+def waves(place: torch.Tensor, seed: int) -> torch.Tensor:
+    """A smooth grey pattern over space, (..., 3) metres -> (...)."""
+    generator = torch.Generator().manual_seed(seed)
+    pitch = torch.randn(24, 3, generator=generator) * 22
+    phase = torch.rand(24, generator=generator) * 6.3
+    return 0.3 * (place @ pitch.T + phase).sin().sum(-1)
+
+
+def drawn(poses: Poses, seed: int = 0) -> torch.Tensor:
+    """A table's top and a wall behind it, (1, T, 1, H, W), seen from T_camera_from_world."""
+    R, t = poses
+    x, y = patch_centres(SIZE, R.device)
+    tan = (FOV_VH / 2).tan()
+    ray = torch.stack([x * tan[1], y * tan[0], torch.ones_like(x)], -1) @ R  # (T, E, 3) in world
+    eye = -(R.mT @ t[..., None])[..., 0][:, None]
+    down = torch.where(ray[..., 1] > 1e-3, (0.25 - eye[..., 1]) / ray[..., 1], torch.inf)
+    ahead = (0.9 - eye[..., 2]) / ray[..., 2]
+    far = torch.minimum(down, ahead)[..., None]
+    return waves(eye + far * ray, seed).unflatten(1, SIZE)[None, :, None]
+
+
+def path(frames: int, turn: float = 0.015, move: float = 0.008) -> Poses:
+    """A camera that turns and moves steadily from the world's origin."""
+    steps = torch.arange(frames)[:, None]
+    R = rotvec_to_matrix(steps * torch.tensor([0.5, 1.0, 0.3]) * turn)
+    return R, steps * torch.tensor([0.8, -0.3, 0.5]) * move
+
+
+def mistaken(poses: Poses, seed: int = 0) -> Poses:
+    """Each motion off by half a degree and 3 mm, in the mean."""
+    generator = torch.Generator().manual_seed(seed)
+    turn, move = (torch.randn(len(poses[1]), 3, generator=generator) for _ in range(2))
+    off = rotvec_to_matrix(0.005 * turn.cumsum(0))
+    return off @ poses[0], poses[1] + 0.002 * move.cumsum(0)
+
+
+def walked(
+    pictures: torch.Tensor, believed: Poses, trust: torch.Tensor, sure: float, fov_vh=FOV_VH
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """What `refine_path` says of one window."""
+    turn, move, near, near_spread, lens = (torch.tensor([value]) for value in BELIEF)
+    R, t = (part[None] for part in believed)
+    spreads = turn / sure, move / sure, near, near_spread, lens / sure
+    return refine_path(pictures, Belief(R, t, *spreads, trust, fov_vh[None]), PATCH)
+
+
+def refined(
+    pictures: torch.Tensor, believed: Poses, trust: torch.Tensor | None = None, sure: float = 1.0
+) -> Poses:
+    """The path of a window; beliefs are surer by a factor."""
+    trust = torch.full((1, PATCHES), 0.5) if trust is None else trust
+    R, t, _ = walked(pictures, believed, trust, sure)
+    return R[0], t[0]
+
+
+def motions(poses: Poses) -> Poses:
+    """Turns and motions from frame to frame."""
+    R = poses[0][1:] @ poses[0][:-1].mT
+    return R, poses[1][1:] - (R @ poses[1][:-1, :, None])[..., 0]
+
+
+def off(poses: Poses, truth: Poses) -> tuple[float, float]:
+    """Mean error of turns in degrees; of motions, lengths fitted, as a share of the truth's."""
+    (R, a), (R_true, b) = motions(poses), motions(truth)
+    length = (a * b).sum() / (a * a).sum()
+    share = (length * a - b).norm(dim=-1).mean() / b.norm(dim=-1).mean()
+    return float(geodesic_angle(R, R_true).rad2deg().mean()), float(share)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("frames", [5, 8])
+def test_a_mistaken_path_is_mended(frames, seed):
+    truth = path(frames)
+    believed = mistaken(truth, seed)
+    before, after = (
+        off(poses, truth) for poses in (believed, refined(drawn(truth, seed), believed))
+    )
+    assert before[0] > 0.2
+    assert after[0] < 0.2 * before[0]
+    assert before[1] > 0.2
+    assert after[1] < 0.4 * before[1]
+
+
+@pytest.mark.parametrize("longer", [0.9, 1.12])
+def test_a_mistaken_lens_is_mended_where_the_camera_turns(longer):
+    truth = path(8, turn=0.02)
+    wrong = 2 * ((FOV_VH / 2).tan() / longer).atan()
+    trust = torch.full((1, PATCHES), 0.5)
+    R, t, fov = walked(drawn(truth), mistaken(truth), trust, 1.0, wrong)
+    assert (wrong - FOV_VH).abs().min() > 0.08
+    assert (fov[0] - FOV_VH).abs().max() < 0.015
+    assert off((R[0], t[0]), truth)[0] < 0.06
+    sure = walked(drawn(truth), mistaken(truth), trust, 1e4, wrong)[2]
+    torch.testing.assert_close(sure[0], wrong, atol=1e-3, rtol=0)
+
+
+def test_the_first_pose_stays_and_the_world_with_it():
+    """Another world gives the same path in that world."""
+    truth = path(6)
+    believed, pictures = mistaken(truth), drawn(truth)
+    R, t = refined(pictures, believed)
+    torch.testing.assert_close((R[0], t[0]), (believed[0][0], believed[1][0]), atol=1e-5, rtol=0)
+    turn, move = rotvec_to_matrix(torch.tensor([0.3, -0.8, 0.5])), torch.tensor([0.2, 1.0, -0.4])
+    elsewhere = refined(pictures, (believed[0] @ turn, believed[1] + believed[0] @ move))
+    torch.testing.assert_close(elsewhere, (R @ turn, t + R @ move), atol=1e-4, rtol=0)
+
+
+def test_a_sure_belief_is_kept():
+    truth = path(6)
+    believed = mistaken(truth)
+    kept = refined(drawn(truth), believed, sure=1e4)
+    torch.testing.assert_close(kept, believed, atol=1e-4, rtol=0)
+    unseen = refined(drawn(truth), believed, trust=torch.full((1, PATCHES), 1e-9))
+    torch.testing.assert_close(unseen[0], believed[0], atol=1e-4, rtol=0)
+
+
+def test_what_is_not_trusted_counts_for_nothing():
+    """Patches of the middle frame that look different; the others' pixels stay."""
+    truth = path(5)
+    believed, pictures = mistaken(truth), drawn(truth)
+    other = pictures.clone()
+    other[:, 2, :, 16:24, 24:32] += 0.1
+    trust = torch.full((1, PATCHES), 0.5)
+    trust.unflatten(1, GRID)[:, 4:6, 6:8] = 0
+    same = refined(other, believed, trust)
+    torch.testing.assert_close(same, refined(pictures, believed, trust), atol=1e-5, rtol=1e-4)
+    assert not torch.allclose(refined(other, believed)[1], same[1], atol=1e-5)
+
+
+def test_trust_learns_what_moves_on_its_own():
+    """Gradients of the error ask for less trust in an arm, and following them helps."""
+    truth = path(8)
+    believed, pictures = mistaken(truth), drawn(truth)
+    x, y = patch_centres(SIZE, pictures.device)
+    for k in range(8):
+        place = torch.stack([0.5 * x - 0.02 * k, 0.4 * y + 0.015 * k, 0 * x], -1)
+        pictures[:, k, 0, 32:, 40:96] = waves(place, 9).unflatten(0, SIZE)[32:, 40:96]
+    arm = torch.zeros(1, PATCHES, dtype=torch.bool)
+    arm.unflatten(1, GRID)[:, 8:, 10:24] = True
+
+    def error(trust: torch.Tensor) -> torch.Tensor:
+        R, t = refined(pictures, believed, trust)
+        return (R - truth[0]).square().sum() + (t - truth[1]).square().sum()
+
+    logits = torch.zeros(1, PATCHES, requires_grad=True)
+    optimiser = torch.optim.Adam([logits], 0.5)
+    first = error(logits.sigmoid())
+    first.backward()
+    assert logits.grad is not None
+    assert logits.grad[arm].mean() > 0
+    for _ in range(16):
+        optimiser.step()
+        optimiser.zero_grad()
+        last = error(logits.sigmoid())
+        last.backward()
+    assert last < 0.5 * first
+    trust = logits.detach().sigmoid()
+    assert trust[arm].mean() < trust[~arm].mean() - 0.1
+    assert error(0.5 * ~arm) < 0.5 * first
+
+
+@pytest.mark.parametrize("frames", [1, 2, 8])
+@pytest.mark.parametrize("level", [0.0, 1.0])
+def test_blank_pictures_leave_what_was_believed(frames, level):
+    """But for how suddenly a head starts and stops."""
+    believed = mistaken(path(frames))
+    R, t = refined(torch.full((1, frames, 1, *SIZE), level), believed)
+    torch.testing.assert_close(R, believed[0], atol=1e-5, rtol=0)
+    torch.testing.assert_close(t, believed[1], atol=0.01, rtol=0)
+
+
+def test_noise_gives_numbers():
+    noise = torch.randn(1, 8, 1, *SIZE, generator=torch.Generator().manual_seed(1))
+    assert all(part.isfinite().all() for part in refined(noise, path(8)))
+
+
+def test_windows_do_not_touch_each_other():
+    truth = path(4)
+    believed = [mistaken(truth, seed) for seed in (0, 1)]
+    windows = [drawn(truth, seed) for seed in (0, 1)]
+    R, t = (torch.stack(parts) for parts in zip(*believed, strict=True))
+    spreads = (torch.full((2,), value) for value in BELIEF)
+    trust = torch.full((2, PATCHES), 0.5)
+    fov = FOV_VH.expand(2, 2)
+    both = refine_path(torch.cat(windows), Belief(R, t, *spreads, trust, fov), PATCH)
+    for k in (0, 1):
+        alone = walked(windows[k], believed[k], trust[:1], 1.0)
+        for mine, other in zip(both, alone, strict=True):
+            torch.testing.assert_close(mine[k], other[0], atol=1e-5, rtol=1e-3)
+
+
+def test_a_network_refines_what_its_camera_head_says():
+    model = small_model(**REFINED)
+    frames = torch.rand(1, 5, 3, 48, 64, generator=torch.Generator().manual_seed(2))
+    with torch.no_grad():
+        output = model(frames)
+        cached = model(patch_tokens=model.encode_frames(frames))
+    *_, believed, last = output.camera_iterations
+    assert len(output.camera_iterations) == model.config.camera_iterations + 1
+    torch.testing.assert_close(last, output.pose_encoding[..., :7])
+    torch.testing.assert_close(cached.pose_encoding, output.pose_encoding, atol=1e-4, rtol=0)
+    first = (last[:, 0, :3], believed[:, 0, :3])
+    torch.testing.assert_close(*first, atol=1e-5, rtol=0)
+    assert not torch.allclose(last[:, 1:, :3], believed[:, 1:, :3], atol=1e-5)
+
+
+def test_training_reaches_every_part_of_the_camera_head():
+    model = small_model(**REFINED).train()
+    truth = path(4)
+    generator = torch.Generator().manual_seed(3)
+    for parameter in model.camera_head.parameters():  # past the zeros it starts with
+        parameter.data += 0.01 * torch.randn(parameter.shape, generator=generator)
+    pictures = 0.1 * drawn(truth)[0, :, :, :48, :64].expand(-1, 3, -1, -1) + 0.5
+    output = model(pictures[None])
+    (output.pose_encoding[0, :, :3] - truth[1]).square().sum().backward()
+    silent = [
+        name
+        for name, parameter in model.camera_head.named_parameters()
+        if parameter.grad is None or not parameter.grad.isfinite().all() or not parameter.grad.any()
+    ]
+    assert silent == []
+
+
+def test_it_loads_as_it_was_saved_and_refuses_what_it_cannot_refine(tmp_path):
+    model = small_model(**REFINED)
+    model.save_pretrained(tmp_path)
+    loaded = MintModel.from_pretrained(tmp_path).eval()
+    frames = torch.rand(1, 3, 3, 48, 64)
+    with torch.no_grad():
+        torch.testing.assert_close(
+            loaded(frames).pose_encoding, model(frames).pose_encoding, rtol=0, atol=0
+        )
+    with pytest.raises(StrictDataclassError, match="motion_radius: expected at least 1"):
+        small_config(**(REFINED | {"motion_radius": 0}))
