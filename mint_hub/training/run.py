@@ -14,7 +14,7 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Literal, Final
 
 import torch
 from transformers.trainer_utils import set_seed
@@ -237,7 +237,9 @@ def _config(request: Request, checkpoint: Path | None) -> MintConfig:
     return MintConfig.from_pretrained(request.init)
 
 
-def _model(request: Request, config: MintConfig, refined_before: str) -> MintModel:
+def _model(
+    request: Request, config: MintConfig, refined_before: Literal["none", "pictures"]
+) -> MintModel:
     if request.init == "random":
         return MintModel(config)
     if request.init.endswith(".pt"):
