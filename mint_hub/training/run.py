@@ -14,7 +14,7 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, Final
+from typing import Any, Final, Literal
 
 import torch
 from transformers.trainer_utils import set_seed
