@@ -10,19 +10,16 @@ Shape letters: B windows, T frames, S = T - 1 of them beside the middle one, N p
 pixels of a patch, E = N Q.
 """
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, pad, unfold
 
-from ..geometry.rotations import matrix_to_rotvec, rotvec_to_matrix
+from ..geometry.rotations import rotvec_to_matrix
+from .belief_mint import Belief, Prior, State, put_back, without
 from .layers_mint import patch_centres
 
 NEARNESS_SPREAD_PER_M = 2.0
 """Of patches about their mean, standard deviation."""
-ACCELERATION_M = 0.003
-"""Of a worn camera from frame to frame, standard deviation about 0."""
 OUTLIER_GREY = (0.3, 0.18)
 """Differences from which a pixel counts for less, at half and at full size."""
 NOISE_GREY = 0.08
@@ -35,82 +32,6 @@ STRONGEST = 24
 """Pixels of a patch that are looked at, those with the steepest slopes."""
 NEAREST_DEPTH = 0.2
 """Of what is before the camera; less is taken as this."""
-
-
-class Belief(NamedTuple):
-    """What is believed of a window before its pictures are laid over each other.
-
-    Attributes:
-        R: (B, T, 3, 3), and
-        t: (B, T, 3), metres: poses T_camera_from_world.
-        turn_rad: (B,), and
-        move_m: (B,): how far each motion from frame to frame may be off, standard deviations.
-        near_per_m: (B,) mean nearness of patches, and
-        near_spread_per_m: (B,): of that mean, standard deviation.
-        lens_spread: (B,): of the logarithm of the focal length, standard deviation.
-        trust: (B, N), 0 to 1: how much each patch of the middle frame stands still.
-        fov_vh: (B, 2) radians.
-    """
-
-    R: Tensor
-    t: Tensor
-    turn_rad: Tensor
-    move_m: Tensor
-    near_per_m: Tensor
-    near_spread_per_m: Tensor
-    lens_spread: Tensor
-    trust: Tensor
-    fov_vh: Tensor
-
-
-class State(NamedTuple):
-    """Where a walk is: poses from the middle frame (B, S, 3, 3), (B, S, 3); nearness of patches
-    (B, N); its mean, and the logarithm of how much longer the lens is than believed, (B, 2).
-    """
-
-    R: Tensor
-    t: Tensor
-    near: Tensor
-    shared: Tensor
-
-
-class Prior:
-    """The weight of a belief."""
-
-    def __init__(self, belief: Belief):
-        self.middle = belief.t.shape[1] // 2
-        R = belief.R @ belief.R[:, self.middle, None].mT
-        t = belief.t - (R @ belief.t[:, self.middle, None, :, None])[..., 0]
-        self.R, self.t = _without(R, self.middle), _without(t, self.middle)
-        steps = torch.eye(t.shape[1], device=t.device).diff(dim=0)
-        bends = steps.diff(dim=0)
-        moves, bends = (_without((d.mT @ d)[None], self.middle)[0].mT for d in (steps, bends))
-        moves, bends = (_without(d[None], self.middle) for d in (moves, bends))
-        self.turns = moves / belief.turn_rad.square()[:, None, None]  # (B, S, S)
-        self.moves = moves / belief.move_m.square()[:, None, None]
-        self.bends = bends / ACCELERATION_M**2
-        self.shared = torch.stack([belief.near_per_m, torch.zeros_like(belief.near_per_m)], -1)
-        self.firm = torch.stack([belief.near_spread_per_m, belief.lens_spread], -1) ** -2.0
-        self.trust = belief.trust
-
-    def start(self) -> State:
-        """The belief itself."""
-        near = self.shared[:, :1].expand(self.trust.shape)
-        return State(*(part.detach() for part in (self.R, self.t, near, self.shared)))
-
-    def pull(self, state: State) -> Tensor:
-        """Gradient of its half square distance to poses, (B, S, 6)."""
-        turned = matrix_to_rotvec(state.R @ self.R.mT)
-        moved = self.moves @ (state.t - self.t) + self.bends @ state.t
-        return torch.cat([self.turns @ turned, moved], -1)
-
-    def square(self) -> Tensor:
-        """Its curvature, (B, 6 S, 6 S)."""
-        parts = [self.turns] * 3 + [self.moves + self.bends] * 3
-        rows = [
-            torch.stack([part * (i == j) for j in range(6)], -1) for i, part in enumerate(parts)
-        ]
-        return torch.stack(rows, 2).flatten(3).flatten(1, 2)  # (B, S, 6, S, 6)
 
 
 class Bundle:
@@ -129,7 +50,7 @@ class Bundle:
         down = pad(pictures[..., 2:, :] - pictures[..., :-2, :], (0, 0, 1, 1))
         right = pad(pictures[..., 2:] - pictures[..., :-2], (1, 1, 0, 0))
         looks = torch.cat([pictures, right * (width / 4), down * (height / 4)], 2)
-        self.others = _without(looks, middle)  # (B, S, 3, H, W)
+        self.others = without(looks, middle)  # (B, S, 3, H, W)
         self.tangents = (fov_vh / 2).tan().flip(-1)[:, None, None]  # (B, 1, 1, 2)
         self.border, self.outlier = 1 - 2 / width, outlier
         x, y = patch_centres((height, width), pictures.device)
@@ -260,19 +181,9 @@ def refine_path(pictures: Tensor, belief: Belief, patch: int) -> tuple[Tensor, T
             state = bundle.step(state, prior)
     state = fine.step(state, prior)
     same = torch.eye(3).to(state.R).expand(batch, 1, 3, 3)
-    R = _with(state.R, same, prior.middle)
-    t = _with(state.t, torch.zeros_like(state.t[:, :1]), prior.middle)
+    R = put_back(state.R, same, prior.middle)
+    t = put_back(state.t, torch.zeros_like(state.t[:, :1]), prior.middle)
     turn = R[:, :1].mT @ belief.R[:, :1]
     moved = R[:, :1].mT @ (belief.t[:, :1] - t[:, :1])[..., None]
     tangents = (belief.fov_vh / 2).tan() * (-state.shared[:, 1:]).exp()
     return R @ turn, t + (R @ moved)[..., 0], 2 * tangents.atan()
-
-
-def _without(values: Tensor, index: int) -> Tensor:
-    """All but one of dimension 1."""
-    return torch.cat([values[:, :index], values[:, index + 1 :]], 1)
-
-
-def _with(values: Tensor, one: Tensor, index: int) -> Tensor:
-    """Put one back in dimension 1."""
-    return torch.cat([values[:, :index], one, values[:, index:]], 1)

@@ -11,9 +11,10 @@ from torch import Tensor, nn
 from ..geometry import hand_state
 from ..geometry.hand_state import HAND_STATE_SIZE, HandState
 from ..geometry.rotations import matrix_to_quat_xyzw, quat_xyzw_to_matrix, rotvec_to_matrix
+from .belief_mint import Belief
 from .configuration_mint import MintConfig
 from .crop_mint import mirror_signs
-from .egomotion_mint import Belief, refine_path
+from .egomotion_mint import refine_path
 from .layers_mint import MintCrossAttention, MintLayer, MintMLP
 
 POSE_SIZE = 7

@@ -5,7 +5,8 @@ import torch
 from huggingface_hub.errors import StrictDataclassError
 
 from mint_hub.geometry.rotations import geodesic_angle, rotvec_to_matrix
-from mint_hub.model.egomotion_mint import Belief, refine_path
+from mint_hub.model.belief_mint import Belief
+from mint_hub.model.egomotion_mint import refine_path
 from mint_hub.model.heads_mint import BELIEF
 from mint_hub.model.layers_mint import patch_centres
 from mint_hub.model.modeling_mint import MintModel
