@@ -22,7 +22,7 @@ MAX_ROTATION_STEP = math.radians(30.0)
 BELIEF = (math.radians(0.6), 0.004, 2.5, 0.75, 0.08)
 """Of a camera head's path, as long as nothing else was learned: a motion's turn (radians) and
 length (metres) may be off by so much; patches are so near (1 / metres), on average, and that may be
-off by so much."""
+off by so much; so may the logarithm of the focal length."""
 MAX_LOG_BELIEF = 2.0
 INITIAL_TRUST = -2.0
 """Logit."""
@@ -128,7 +128,9 @@ class MintPathRefinement(nn.Module):
         self.camera_norm = nn.LayerNorm(width)
         self.belief = nn.Linear(width, len(BELIEF))
 
-    def forward(self, pose: Tensor, fov_vh: Tensor, tokens: Tensor, pictures: Tensor) -> Tensor:
+    def forward(
+        self, pose: Tensor, fov_vh: Tensor, tokens: Tensor, pictures: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Refine windows.
 
         Args:
@@ -138,7 +140,7 @@ class MintPathRefinement(nn.Module):
             pictures: (B, T, 1, H, W), as of `describe`.
 
         Returns:
-            Poses (B, T, 7).
+            Poses (B, T, 7), and the field of view (B, 2).
         """
         with torch.autocast(tokens.device.type, enabled=False):
             tokens = tokens.to(self.belief.weight.dtype)

@@ -72,7 +72,8 @@ class MintOutput(ModelOutput):
         last_hidden_state: (B, T, P, 2C) tokens of the last frame and global layers, joined.
         pose_encoding: (B, T, 9) camera state: translation 3, quaternion xyzw 4 (not normalised),
             field of view (vertical, horizontal); world-to-camera, OpenCV axes.
-        camera_iterations: translation and quaternion (B, T, 7) after each iteration, last one last.
+        camera_iterations: translation and quaternion (B, T, 7) after each iteration, last one last;
+            behind them, refined by pictures, if the configuration says so.
         hand_state: (B, T, 2, 109) camera-frame hands after the last iteration (see hand_state.py).
         initial_hand_state: (B, T, 2, 109) camera-frame hands of the first iteration.
         presence_logits: (B, T, 2), at or above 0 where a hand is in the picture.

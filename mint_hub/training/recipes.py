@@ -258,6 +258,11 @@ def recipe_named(name: str) -> Recipe:
         raise ValueError(
             f"recipe {name!r}: the hands are frozen in stage 2: expected no world loss"
         )
+    if made.stage == 1 and made.refine:
+        raise ValueError(
+            f"recipe {name!r}: pictures refine what a camera head has learned: expected +refine "
+            "after stage2 alone"
+        )
     return replace(made, name=name)
 
 

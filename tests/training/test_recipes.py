@@ -85,6 +85,7 @@ def test_every_option_changes_a_stage_1_recipe():
         ("stage3", "expected stage1, stage2, paper-stage1"),
         ("stage1+colour", "expected options .*got 'colour'"),
         ("stage2+world", "hands are frozen in stage 2"),
+        ("stage1+refine", r"expected \+refine after stage2 alone"),
     ],
 )
 def test_names_that_mean_nothing(name, message):
