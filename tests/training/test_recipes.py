@@ -69,12 +69,12 @@ def test_ablations_have_names(choices, name):
     assert recipe_named(name) == made
 
 
-def test_every_option_changes_a_stage_1_recipe():
-    base = recipe_named("paper-stage1")
+def test_every_option_changes_a_recipe():
     for option in OPTIONS:
-        changed = recipe_named(f"paper-stage1+{option}")
+        name = "paper-stage2" if option == "refine" else "paper-stage1"
+        base, changed = recipe_named(name), recipe_named(f"{name}+{option}")
         fields = ("loss", "init", "sources", "presence", "augment", "views", "optimisation")
-        fields += ("learning_rates",)
+        fields += ("learning_rates", "refine")
         same = all(getattr(changed, f) == getattr(base, f) for f in fields)
         assert same == (option == "world"), option  # the paper's has the world already
 
