@@ -117,7 +117,8 @@ class MintPathRefinement(nn.Module):
     """Makes a path exact by its pictures, and learns what of them to believe.
 
     Which patches stand still, how far the path may be off, and how near things are; weights for
-    bundle adjustment are learned through it as in DROID-SLAM (Teed and Deng 2021).
+    bundle adjustment are learned through it as in DROID-SLAM (Teed and Deng 2021). The path itself
+    does not learn through it: errors that pictures mend would teach it nothing.
     """
 
     def __init__(self, width: int, patch: int):
@@ -149,8 +150,9 @@ class MintPathRefinement(nn.Module):
             told = self.belief(self.camera_norm(tokens[:, :, 0]).mean(1))
             told = (MAX_LOG_BELIEF * torch.tanh(told / MAX_LOG_BELIEF)).exp()
             spreads = [usual * ratio for usual, ratio in zip(BELIEF, told.unbind(-1), strict=True)]
-            R = quat_xyzw_to_matrix(pose[..., 3:], check=False)
-            belief = Belief(R, pose[..., :3], *spreads, trust, fov_vh.float().mean(1))
+            t, quat = pose.detach().split([3, 4], -1)
+            R = quat_xyzw_to_matrix(quat, check=False)
+            belief = Belief(R, t, *spreads, trust, fov_vh.float().mean(1))
             R, t, fov = refine_path(pictures, belief, self.patch)
             return torch.cat([t, matrix_to_quat_xyzw(R)], -1), fov
 

@@ -508,6 +508,14 @@ def total(case: LossCase) -> tuple[Tensor, dict[str, Tensor]]:
     return loss, terms
 
 
+def camera_loss(case: LossCase, pose_encoding: Tensor) -> Tensor:
+    """The weighted sum of the camera's terms, for another path (B, T, 9) of the same windows."""
+    weights = {n: weight for n, weight in case.settings.weights.items() if n.startswith("camera/")}
+    prediction = {**case.prediction, "pose_encoding": pose_encoding}
+    settings = replace(case.settings, weights=weights)
+    return total(replace(case, prediction=prediction, settings=settings))[0]
+
+
 def default_hand(shape_space: str) -> HandModel:
     """The user's MANO hand for the "mano" space where there is one, else the template."""
     return HandModel.default() if shape_space == "mano" else HandModel.template()

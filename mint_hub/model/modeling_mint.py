@@ -51,7 +51,14 @@ from .layers_mint import (
     rotary_positions,
 )
 from .loading_mint import load_checked
-from .losses_mint import ATTENTION_TERM, RELEASE_STAGE_1, LossCase, LossSettings, total
+from .losses_mint import (
+    ATTENTION_TERM,
+    RELEASE_STAGE_1,
+    LossCase,
+    LossSettings,
+    camera_loss,
+    total,
+)
 from .motion_mint import MintMotionCue, describe
 from .saving_mint import SavesCode
 
@@ -529,6 +536,9 @@ class MintModel(MintPreTrainedModel):
         if labels is not None:
             case = self._loss_case(output, labels, grid_hw, looks, where)
             output.loss, output.losses = total(case)
+            if self.camera_head.refinement is not None:  # what is refined learns by its own errors
+                believed = torch.cat([poses[-2], output.pose_encoding[..., 7:]], -1)
+                output.loss = output.loss + camera_loss(case, believed)
         return output
 
     def _loss_case(

@@ -4,11 +4,13 @@ import pytest
 import torch
 from huggingface_hub.errors import StrictDataclassError
 
-from mint_hub.geometry.rotations import geodesic_angle, rotvec_to_matrix
+from mint_hub.geometry.hand_state import absent
+from mint_hub.geometry.rotations import geodesic_angle, matrix_to_quat_xyzw, rotvec_to_matrix
 from mint_hub.model.belief_mint import Belief
 from mint_hub.model.egomotion_mint import refine_path
 from mint_hub.model.heads_mint import BELIEF
 from mint_hub.model.layers_mint import patch_centres
+from mint_hub.model.losses_mint import RELEASE_STAGE_2, LossSettings
 from mint_hub.model.modeling_mint import MintModel
 from tests.small_model import small_config, small_model
 
@@ -232,6 +234,36 @@ def test_a_network_refines_what_its_camera_head_says():
     assert not torch.allclose(last[:, 1:, :3], believed[:, 1:, :3], atol=1e-5)
 
 
+def labels_of(truth: Poses) -> dict[str, torch.Tensor]:
+    """Of one window: its path; hands are absent."""
+    frames = len(truth[1])
+    fov = FOV_VH.expand(frames, 2)
+    pose = torch.cat([truth[1], matrix_to_quat_xyzw(truth[0]), fov], -1)
+    absent_hands = absent((1, frames, 2)).astype("float32")
+    return {
+        "pose_encoding": pose[None],
+        "hand_state": torch.from_numpy(absent_hands),
+        "presence": torch.zeros(1, frames, 2, dtype=torch.bool),
+    }
+
+
+def test_the_path_that_is_refined_learns_by_its_own_errors():
+    """The loss has both paths' camera terms; hands' terms once."""
+    model, truth = small_model(**REFINED), path(4)
+    pictures = torch.rand(1, 4, 3, 48, 64, generator=torch.Generator().manual_seed(4))
+    with torch.no_grad():
+        output = model(pictures, labels=labels_of(truth))
+    assert output.loss is not None
+    weights = model.loss_settings.weights
+    once = sum(weights[name] * float(value) for name, value in output.losses.items())
+    model.camera_head.refinement = None
+    with torch.no_grad():
+        unrefined = model(pictures, labels=labels_of(truth)).losses
+    own = sum(weights[n] * float(v) for n, v in unrefined.items() if n.startswith("camera/"))
+    assert own > 0
+    assert float(output.loss) == pytest.approx(once + own, rel=1e-5)
+
+
 def test_training_reaches_every_part_of_the_camera_head():
     model = small_model(**REFINED).train()
     truth = path(4)
@@ -239,8 +271,10 @@ def test_training_reaches_every_part_of_the_camera_head():
     for parameter in model.camera_head.parameters():  # past the zeros it starts with
         parameter.data += 0.01 * torch.randn(parameter.shape, generator=generator)
     pictures = 0.1 * drawn(truth)[0, :, :, :48, :64].expand(-1, 3, -1, -1) + 0.5
-    output = model(pictures[None])
-    (output.pose_encoding[0, :, :3] - truth[1]).square().sum().backward()
+    model.loss_settings = LossSettings(RELEASE_STAGE_2)
+    output = model(pictures[None], labels=labels_of(truth))
+    assert output.loss is not None
+    output.loss.backward()
     silent = [
         name
         for name, parameter in model.camera_head.named_parameters()
