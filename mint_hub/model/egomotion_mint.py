@@ -10,6 +10,8 @@ Shape letters: B windows, T frames, S = T - 1 of them beside the middle one, N p
 pixels of a patch, E = N Q.
 """
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, pad, unfold
@@ -32,6 +34,24 @@ STRONGEST = 24
 """Pixels of a patch that are looked at, those with the steepest slopes."""
 NEAREST_DEPTH = 0.2
 """Of what is before the camera; less is taken as this."""
+
+
+class Equations(NamedTuple):
+    """Curvature and gradient of half the square error, U = 6 S + 2 unknowns that patches share.
+
+    Attributes:
+        square: (B, U, U), poses (turn and motion), mean nearness, lens.
+        pull: (B, U).
+        cross: (B, N, U), of each patch's nearness with these.
+        firm: (B, N), of its nearness alone, and
+        drawn: (B, N), gradient.
+    """
+
+    square: Tensor
+    pull: Tensor
+    cross: Tensor
+    firm: Tensor
+    drawn: Tensor
 
 
 class Bundle:
@@ -94,12 +114,8 @@ class Bundle:
         by_lens = by_lens - (slope * (rays @ state.R[..., :2].mT)).sum(-1)
         return off, weight, by_pose, (slope * state.t[:, :, None]).sum(-1), by_lens
 
-    def step(self, state: State, prior: Prior) -> State:
-        """One step of Gauss-Newton.
-
-        Each patch's nearness touches only its own pixels, so that it is solved for within the
-        system of poses (the Schur complement of bundle adjustment; Triggs et al. 2000).
-        """
+    def equations(self, state: State, prior: Prior) -> Equations:
+        """What one step of Gauss-Newton solves."""
         with torch.no_grad():
             off, weight, by_pose, by_near, by_lens = self.look(state)
         others = state.t.shape[1]
@@ -131,6 +147,16 @@ class Bundle:
         firm = self.sums((weight * by_near.square())[..., None])[..., 0].sum(1) + stiff
         drawn = self.sums((weight * by_near * off)[..., None])[..., 0].sum(1) + stiff * apart
 
+        return Equations(square, pull, cross, firm, drawn)
+
+    def step(self, state: State, prior: Prior) -> State:
+        """One step of Gauss-Newton.
+
+        Each patch's nearness touches only its own pixels, so that it is solved for within the
+        system of poses (the Schur complement of bundle adjustment; Triggs et al. 2000).
+        """
+        square, pull, cross, firm, drawn = self.equations(state, prior)
+        others = state.t.shape[1]
         shared = cross / firm[..., None]
         rest = pull - (shared * drawn[..., None]).sum(1)
         move = -torch.linalg.solve(square - shared.mT @ cross, rest)
