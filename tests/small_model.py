@@ -1,5 +1,7 @@
 """A network small enough for every test, with weights that make its outputs vary."""
 
+from pathlib import Path
+
 import torch
 
 from mint_hub.model.configuration_mint import MintConfig
@@ -41,3 +43,12 @@ def small_model(seed: int = 0, **overrides) -> MintModel:
         for parameter in model.presence_head.parameters():
             parameter.mul_(8)
     return model
+
+
+def assert_loads_as_saved(model: MintModel, frames: torch.Tensor, folder: Path) -> None:
+    """A network that is saved and loaded sees the same, bit for bit."""
+    model.save_pretrained(folder)
+    loaded = MintModel.from_pretrained(folder).eval()
+    with torch.no_grad():
+        mine, other = (m(frames).pose_encoding for m in (model, loaded))
+    torch.testing.assert_close(other, mine, rtol=0, atol=0)

@@ -11,8 +11,7 @@ from mint_hub.model.egomotion_mint import refine_path
 from mint_hub.model.heads_mint import BELIEF
 from mint_hub.model.layers_mint import patch_centres
 from mint_hub.model.losses_mint import RELEASE_STAGE_2, LossSettings
-from mint_hub.model.modeling_mint import MintModel
-from tests.small_model import small_config, small_model
+from tests.small_model import assert_loads_as_saved, small_config, small_model
 
 SIZE = (96, 128)
 PATCH = 4
@@ -285,12 +284,6 @@ def test_training_reaches_every_part_of_the_camera_head():
 
 def test_it_loads_as_it_was_saved_and_refuses_what_it_cannot_refine(tmp_path):
     model = small_model(**REFINED)
-    model.save_pretrained(tmp_path)
-    loaded = MintModel.from_pretrained(tmp_path).eval()
-    frames = torch.rand(1, 3, 3, 48, 64)
-    with torch.no_grad():
-        torch.testing.assert_close(
-            loaded(frames).pose_encoding, model(frames).pose_encoding, rtol=0, atol=0
-        )
+    assert_loads_as_saved(model, torch.rand(1, 3, 3, 48, 64), tmp_path)
     with pytest.raises(StrictDataclassError, match="motion_radius: expected at least 1"):
         small_config(**(REFINED | {"motion_radius": 0}))

@@ -8,9 +8,8 @@ from mint_hub.geometry.rotations import quat_xyzw_to_matrix
 from mint_hub.inference.network import WindowNetwork
 from mint_hub.model.alignment_mint import Alignment
 from mint_hub.model.heads_mint import chained
-from mint_hub.model.modeling_mint import MintModel
 from mint_hub.model.motion_mint import SHIFT_UNIT, MintMotionCue, describe
-from tests.small_model import small_config, small_model
+from tests.small_model import assert_loads_as_saved, small_config, small_model
 
 CUE = {"patch_size": 8, "image_size": (48, 64), "motion_radius": 3}
 
@@ -104,13 +103,7 @@ def test_windows_from_cached_tokens_are_windows_from_pixels():
 
 def test_it_loads_as_it_was_saved_and_refuses_other_patches(tmp_path):
     model = small_model(**CUE)
-    model.save_pretrained(tmp_path)
-    loaded = MintModel.from_pretrained(tmp_path).eval()
-    frames = torch.rand(1, 3, 3, 48, 64)
-    with torch.no_grad():
-        torch.testing.assert_close(
-            loaded(frames).pose_encoding, model(frames).pose_encoding, rtol=0, atol=0
-        )
+    assert_loads_as_saved(model, torch.rand(1, 3, 3, 48, 64), tmp_path)
     with pytest.raises(StrictDataclassError, match="expected a multiple of 4 with a motion_radius"):
         small_config(patch_size=14, motion_radius=2)
 
