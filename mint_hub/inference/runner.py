@@ -61,7 +61,7 @@ class RunSettings:
         chain_over: align windows over "all" frames they share, or the "first" one, as the public
             release does.
         fixed_lens: the lens does not zoom: the field of view is one for the whole video, the median
-            of what was predicted frame by frame.
+            of what was predicted frame by frame; hands keep their place in the picture.
         on_error: what damage in the middle of a video does: "raise", or "stop" and keep what came.
 
     """

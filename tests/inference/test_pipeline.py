@@ -9,6 +9,7 @@ from transformers import pipeline
 
 import mint_hub
 from mint_hub.geometry import rigid
+from mint_hub.geometry.hand_state import keep_in_picture
 from mint_hub.loaders.schema import Episode
 from tests import video_files
 from tests.small_model import small_model
@@ -132,12 +133,14 @@ def test_smoothing_and_settings_are_recorded(pipe, clip, episode):
 
 
 def test_a_lens_that_does_not_zoom_has_one_field_of_view(pipe, clip, episode):
-    """The median of the frames' own, which differ; hands are where they were."""
+    """The median of the frames' own, which differ; hands are where they were in the picture."""
     each = pipe(clip, fixed_lens=False)
     assert np.ptp(each.fov_vh_rad, axis=0).min() > 0
     one = np.median(each.fov_vh_rad, axis=0)
     np.testing.assert_allclose(episode.fov_vh_rad, np.tile(one, (episode.num_frames, 1)), rtol=1e-6)
-    np.testing.assert_array_equal(each.hand_state, episode.hand_state)
+    expected = keep_in_picture(each.hand_state, each.fov_vh_rad, episode.fov_vh_rad)
+    assert not np.array_equal(each.hand_state, episode.hand_state)
+    np.testing.assert_allclose(episode.hand_state, expected, rtol=1e-4, atol=1e-6)
     assert each.meta["provenance"]["settings"]["fixed_lens"] is False
 
 
