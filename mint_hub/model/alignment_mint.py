@@ -68,6 +68,18 @@ def fit_field(shifts: Tensor, weights: Tensor, places: tuple[Tensor, Tensor]) ->
     return field
 
 
+def with_slopes(pictures: Tensor) -> Tensor:
+    """Grey (..., 1, H, W) -> grey, and its slopes down and right a pixel, (..., 3, H, W)."""
+    down = nn.functional.pad((pictures[..., 2:, :] - pictures[..., :-2, :]) / 2, (0, 0, 1, 1))
+    right = nn.functional.pad((pictures[..., 2:] - pictures[..., :-2]) / 2, (1, 1, 0, 0))
+    return torch.cat([pictures, down, right], -3)
+
+
+def robust_weight(off: Tensor, outlier: float) -> Tensor:
+    """How much pixels count that differ by so much (Geman and McClure 1987)."""
+    return 1 / (1 + (off / outlier).square()).square()
+
+
 class Alignment:
     """Pictures (F, 1, H, W) over those before them, and the field between, in their pixels.
 
@@ -78,9 +90,7 @@ class Alignment:
     def __init__(self, now: Tensor, before: Tensor):
         self.size_hw = (now.shape[-2], now.shape[-1])
         self.now = now.flatten(1)
-        down = nn.functional.pad((before[..., 2:, :] - before[..., :-2, :]) / 2, (0, 0, 1, 1))
-        right = nn.functional.pad((before[..., 2:] - before[..., :-2]) / 2, (1, 1, 0, 0))
-        self.before = torch.cat([before, down, right], 1)
+        self.before = with_slopes(before)
         x, y = patch_centres(self.size_hw, now.device)
         self.places = torch.stack([x, y], -1)
         self.terms = terms_at(x, y)
@@ -104,7 +114,7 @@ class Alignment:
         grey, down, right = seen.flatten(2).unbind(1)
         off = grey - self.now
         inside = (grid.abs() < 1 - 2 / width).all(-1)
-        return off, down, right, inside / (1 + (off / OUTLIER_GREY).square()).square()
+        return off, down, right, inside * robust_weight(off, OUTLIER_GREY)
 
     def refine(self, field: Tensor, steps: int) -> Tensor:
         """Walk from a field (F, 6, 2) to a better one."""

@@ -60,10 +60,8 @@ class Prior:
         R = belief.R @ belief.R[:, self.middle, None].mT
         t = belief.t - (R @ belief.t[:, self.middle, None, :, None])[..., 0]
         self.R, self.t = without(R, self.middle), without(t, self.middle)
-        steps = torch.eye(t.shape[1], device=t.device).diff(dim=0)
-        bends = steps.diff(dim=0)
-        moves, bends = (without((d.mT @ d)[None], self.middle)[0].mT for d in (steps, bends))
-        moves, bends = (without(d[None], self.middle) for d in (moves, bends))
+        steps = without(torch.eye(t.shape[1], device=t.device).diff(dim=0), self.middle)
+        moves, bends = (d.mT @ d for d in (steps, steps.diff(dim=0)))
         self.turns = moves / belief.turn_rad.square()[:, None, None]  # (B, S, S)
         self.moves = moves / belief.move_m.square()[:, None, None]
         self.bends = bends / ACCELERATION_M**2

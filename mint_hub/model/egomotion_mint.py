@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, pad, unfold
 
 from ..geometry.rotations import rotvec_to_matrix
+from .alignment_mint import robust_weight, with_slopes
 from .belief_mint import Belief, Prior, State, put_back, without
 from .layers_mint import patch_centres
 
@@ -67,9 +68,8 @@ class Bundle:
     def __init__(self, pictures: Tensor, fov_vh: Tensor, patch: int, outlier: float):
         batch, (height, width) = len(pictures), pictures.shape[-2:]
         middle = pictures.shape[1] // 2
-        down = pad(pictures[..., 2:, :] - pictures[..., :-2, :], (0, 0, 1, 1))
-        right = pad(pictures[..., 2:] - pictures[..., :-2], (1, 1, 0, 0))
-        looks = torch.cat([pictures, right * (width / 4), down * (height / 4)], 2)
+        units = torch.tensor([1, height / 2, width / 2], device=pictures.device)
+        looks = with_slopes(pictures) * units[:, None, None]
         self.others = without(looks, middle)  # (B, S, 3, H, W)
         self.tangents = (fov_vh / 2).tan().flip(-1)[:, None, None]  # (B, 1, 1, 2)
         self.border, self.outlier = 1 - 2 / width, outlier
@@ -102,10 +102,10 @@ class Bundle:
         seen = grid_sample(
             self.others.flatten(0, 1), at.flatten(0, 1)[:, None], align_corners=False
         )
-        grey, right, down = seen[:, :, 0].unflatten(0, state.t.shape[:2]).unbind(2)
+        grey, down, right = seen[:, :, 0].unflatten(0, state.t.shape[:2]).unbind(2)
         off = grey - self.grey
         inside = (at.abs() < self.border).all(-1)
-        weight = inside / (1 + (off / self.outlier).square()).square()
+        weight = inside * robust_weight(off, self.outlier)
         slope = torch.stack([right, down], -1)
         by_lens = (slope * at).sum(-1)
         slope = slope / tangents / depth
@@ -142,11 +142,11 @@ class Bundle:
         side = pad((bent[..., None] * by_pose).sum(2).flatten(1), (0, 2))
         last = torch.eye(square.shape[-1], device=off.device)[-1]
         square = square + side[:, :, None] * last + (side[:, :, None] * last).mT
-        with_lens = self.sums((bent * by_near)[..., None])[..., 0].sum(1)[..., None]
-        cross = torch.cat([cross, torch.full_like(with_lens, -stiff), with_lens], -1)
-        firm = self.sums((weight * by_near.square())[..., None])[..., 0].sum(1) + stiff
-        drawn = self.sums((weight * by_near * off)[..., None])[..., 0].sum(1) + stiff * apart
-
+        near = (weight * by_near)[..., None] * torch.stack([by_near, off, by_lens], -1)
+        firm, drawn, with_lens = self.sums(near).sum(1).unbind(-1)
+        to_mean = torch.full_like(with_lens, -stiff)
+        cross = torch.cat([cross, torch.stack([to_mean, with_lens], -1)], -1)
+        firm, drawn = firm + stiff, drawn + stiff * apart
         return Equations(square, pull, cross, firm, drawn)
 
     def step(self, state: State, prior: Prior) -> State:
