@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
@@ -34,7 +35,7 @@ def in_order(
     each process once. Processes end with the generator, and also when their parent is killed: one
     that is closed, or that raises, waits for the items in hand and leaves those that wait. They
     start as Python has it by default, or as ``start`` says: what holds threads or graphics must
-    not be forked.
+    not be forked. Each computes with its share of the cores.
 
     Raises:
         CorpusError: a process died. What ``function`` raises is raised here.
@@ -50,7 +51,7 @@ def in_order(
         # Without a lock, which a process that dies could keep. The pool could not cancel these: all
         # that wait here are in its queue to the processes.
         left: Any = context.RawValue("b", 0)
-        with ProcessPoolExecutor(num_procs, context, _begin, (function, left)) as pool:
+        with ProcessPoolExecutor(num_procs, context, _begin, (function, left, num_procs)) as pool:
             try:
                 while part := list(islice(stream, batch)):
                     waiting.append(pool.submit(_do, part))
@@ -66,10 +67,19 @@ def in_order(
         ) from None
 
 
-def _begin(function: Callable[[Any], Any], left: Any) -> None:
+def _begin(function: Callable[[Any], Any], left: Any, num_procs: int) -> None:
     global _function, _left
     _function, _left = function, left
+    _share_cores(num_procs)
     threading.Thread(target=_leave_with_parent, daemon=True).start()
+
+
+def _share_cores(num_procs: int) -> None:
+    """Leave the others theirs: with a thread for every core in every process, each waits on all."""
+    share = max(1, (os.cpu_count() or 1) // num_procs)
+    os.environ.setdefault("OMP_NUM_THREADS", str(share))  # read by what is loaded later
+    if (torch := sys.modules.get("torch")) is not None:
+        torch.set_num_threads(min(torch.get_num_threads(), share))
 
 
 def _leave_with_parent() -> None:

@@ -410,6 +410,19 @@ def test_items_that_wait_are_left_when_the_results_are(tmp_path, monkeypatch):
     assert begun <= {"begun-0", "begun-1", "begun-2"}  # of five that were handed out
 
 
+def _threads(_: int) -> int:
+    import torch
+
+    return torch.get_num_threads()
+
+
+@pytest.mark.parametrize("start", ["fork", "spawn"])
+def test_processes_share_the_cores(start, monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    assert set(in_order(_threads, range(4), 2, batch=1, start=start)) == {1}
+
+
 def test_an_error_in_a_process_arrives_and_a_death_is_told():
     with pytest.raises(TypeError, match="bad operand"):
         list(in_order(abs, [1, "x"], 2))
