@@ -25,8 +25,8 @@ def add_evaluate(commands: Any) -> None:
     add = parser.add_argument
     add(
         "model",
-        help="folder or hub repository of a checkpoint; or a folder with labels: saved episodes "
-        f'(KEY.npz, KEY/episode.npz), a corpus; or the word "{TRIVIAL}": the answers without a '
+        help="mint-tiny, folder or hub repository of a checkpoint; or a folder with labels: saved "
+        f'episodes (KEY.npz, KEY/episode.npz), a corpus; or the word "{TRIVIAL}": the answers without a '
         "model alone",
     )
     _add_benchmark(parser)

@@ -27,7 +27,9 @@ def add_train(commands: Any) -> None:
     add = parser.add_argument
     add("--recipe", required=True, help="stage1, stage2, or a name with +options")
     add("--data", nargs="+", required=True, metavar="DIR", help="corpora, configs or splits")
-    add("--init", required=True, help="random, lingbot-map.pt, or a folder or repository")
+    add(
+        "--init", required=True, help="random, lingbot-map.pt, a folder or repository, or mint-tiny"
+    )
     add("-o", "--out", type=Path, required=True, help="folder of the run; the network: OUT/model")
     add("--config", help="tiny, full, or a folder with config.json (default: the checkpoint's)")
     add("--steps", type=int, required=True, help="steps of the whole run")

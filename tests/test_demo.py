@@ -8,7 +8,7 @@ import torch
 from safetensors import safe_open
 from transformers import pipeline
 
-from mint_hub.assets import asset_path, default_model, sample_clip
+from mint_hub.assets import asset_path, checkpoint_named, default_model, sample_clip
 from mint_hub.cli import main
 from mint_hub.cli_demo import METRICS
 from mint_hub.geometry.rigid import inverse
@@ -68,6 +68,18 @@ def test_the_pipeline_takes_it_by_default(out):
     stored = MintModel.from_pretrained(default_model()).state_dict()
     for name, value in pipe.model.state_dict().items():
         assert torch.equal(value.float(), stored[name].float()), name
+
+
+def test_its_name_means_it_unless_a_folder_has_that_name(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert checkpoint_named("mint-tiny") == str(default_model())
+    assert checkpoint_named("ORG/mint-tiny") == "ORG/mint-tiny"
+    assert main(["info", "--model", "mint-tiny"]) == 0
+    assert "128 x 160" in capsys.readouterr().out
+    (tmp_path / "mint-tiny").mkdir()
+    assert checkpoint_named("mint-tiny") == "mint-tiny"
+    assert main(["demo", "--model", "./missing", "-o", "out"]) == 2
+    assert "./missing: expected a folder with a checkpoint" in capsys.readouterr().err
 
 
 def test_its_folder_is_small_whole_and_says_what_it_is():

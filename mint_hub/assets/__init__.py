@@ -25,3 +25,8 @@ def sample_clip() -> Path:
 def default_model() -> Path:
     """Return the folder of the embedded network, mint-tiny: trained on synthetic clips only."""
     return asset_path("mint_tiny")
+
+
+def checkpoint_named(name: str) -> str:
+    """Return where a checkpoint lies: "mint-tiny" is the embedded one, any other is as named."""
+    return str(default_model()) if name == "mint-tiny" and not Path(name).exists() else name

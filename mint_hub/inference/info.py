@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from mint_hub._version import __version__
-from mint_hub.assets import default_model
+from mint_hub.assets import checkpoint_named, default_model
 from mint_hub.geometry.hand_model import HandModel
 from mint_hub.model.configuration_mint import MintConfig
 from mint_hub.model.conversion_mint import RELEASE_MARKER, config_from_layout, read_layout
@@ -25,7 +25,7 @@ def collect(model: str | None = None, mano_dir: Path | None = None) -> dict[str,
     """Facts as plain JSON values.
 
     Args:
-        model: folder or hub repository of a checkpoint to describe.
+        model: folder or hub repository of a checkpoint to describe, or "mint-tiny".
         mano_dir: folder with MANO's files.
 
     Raises:
@@ -43,7 +43,7 @@ def collect(model: str | None = None, mano_dir: Path | None = None) -> dict[str,
         "default checkpoint": f"mint-tiny, embedded, synthetic clips only: {default_model()}",
     }
     if model is not None:
-        facts["model"] = _describe_model(model)
+        facts["model"] = _describe_model(checkpoint_named(model))
     return facts
 
 

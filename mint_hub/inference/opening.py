@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from mint_hub.assets import default_model
+from mint_hub.assets import checkpoint_named
 from mint_hub.geometry.hand_model import HandModel
 from mint_hub.inference.devices import available_devices, copies_on
 from mint_hub.inference.runner import MintRunner
@@ -17,7 +17,7 @@ def open_model(
     """Load a checkpoint.
 
     Args:
-        name: folder or hub repository; None: the embedded one.
+        name: folder or hub repository; None or "mint-tiny": the embedded one.
         dtype: "auto", that of the file, or a name of torch's.
         revision: of a hub repository.
 
@@ -26,9 +26,9 @@ def open_model(
         OSError: no checkpoint can be read there.
 
     """
-    name = name or str(default_model())
+    name = checkpoint_named(name or "mint-tiny")
     if name.startswith((".", "/", "~")) and not Path(name).expanduser().is_dir():
-        raise ValueError(f"--model: no such folder: {name}")
+        raise ValueError(f"{name}: expected a folder with a checkpoint, found no such folder")
     return MintModel.from_pretrained(name, dtype=dtype, revision=revision)
 
 

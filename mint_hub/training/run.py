@@ -20,6 +20,7 @@ import torch
 from transformers.trainer_utils import set_seed
 
 from mint_hub._version import __version__
+from mint_hub.assets import checkpoint_named
 from mint_hub.loaders.atomic import replacing
 from mint_hub.loaders.resolvers import Videos
 from mint_hub.model.configuration_mint import MintConfig
@@ -58,7 +59,8 @@ class Request:
         data: corpus folders, their configs, or splits.
         out: folder of the run.
         pace: length of the run, and how often what is written.
-        init: "random"; a LingBot-Map checkpoint (.pt); or a folder or repository of a MINT model.
+        init: "random"; a LingBot-Map checkpoint (.pt); a folder or repository of a MINT model; or
+            "mint-tiny", the embedded one.
         config: sizes of the network; needed with "random" and .pt, checked with a model.
         validation: corpus folders to score on during training; None: the validation splits of
             ``data``, where the pace asks for scores.
@@ -231,10 +233,10 @@ def _config(request: Request, checkpoint: Path | None) -> MintConfig:
         raise ValueError(f"--init {request.init}: no such folder")
     if request.config is not None:
         return request.config
-    folder = Path(request.init)
+    folder = Path(checkpoint_named(request.init))
     if folder.is_dir() and not (folder / "config.json").is_file():
         return MintConfig.full()  # of the public release; from_pretrained checks its shapes
-    return MintConfig.from_pretrained(request.init)
+    return MintConfig.from_pretrained(checkpoint_named(request.init))
 
 
 def _model(
@@ -245,7 +247,9 @@ def _model(
     if request.init.endswith(".pt"):
         return MintModel.from_lingbot_map(request.init, config)
     config.camera_refinement = refined_before  # as the weights are
-    model = MintModel.from_pretrained(request.init, config=config, dtype=torch.float32)
+    model = MintModel.from_pretrained(
+        checkpoint_named(request.init), config=config, dtype=torch.float32
+    )
     if request.recipe.refine:
         model.refine_by_pictures()
     return model

@@ -13,8 +13,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mint_hub.assets import checkpoint_named
 from mint_hub.geometry.camera import fov_vh_to_K
-from mint_hub.inference.devices import available_device
+from mint_hub.inference.opening import open_model, runner_of
 from mint_hub.inference.runner import MintRunner, RunSettings
 from mint_hub.labelling.frames import clip_frames
 from mint_hub.labelling.readiness import Lack, check
@@ -29,8 +30,6 @@ from mint_hub.labelling.stage import (
     require,
 )
 from mint_hub.loaders.schema import Episode
-from mint_hub.model.modeling_mint import MintModel
-from mint_hub.model.processing_mint import MintProcessor
 
 _SURE: Final = 0.05
 """Focal lengths of windows that differ by this much have confidence 1/2."""
@@ -41,7 +40,8 @@ class MintSettings:
     """Settings of the three stages.
 
     Attributes:
-        model: a folder with a checkpoint as `transformers` loads it, or a repository ORG/NAME.
+        model: a folder with a checkpoint as `transformers` loads it, a repository ORG/NAME, or
+            "mint-tiny".
         device: "cuda:0", "mps", "cpu".
         presence_threshold: a hand is present where its logit is at least this.
         batch_size: windows that go through the network at once.
@@ -96,13 +96,11 @@ class MintStage:
         """
         if self._runner is None:
             check(self.lacks())
-            device = available_device(self.settings.device)
             try:
-                model: Any = MintModel.from_pretrained(self.settings.model)
-            except OSError as error:
+                model = open_model(self.settings.model)
+            except (OSError, ValueError) as error:
                 raise NotReadyError(f"MINT checkpoint {self.settings.model}: {error}") from error
-            processor = MintProcessor.for_config(model.config)
-            self._runner = MintRunner(model.eval().to(device), processor)
+            self._runner = runner_of(model, [self.settings.device])
         return self._runner
 
     def predict(self, images: NDArray[np.uint8], clip: Clip) -> Episode:
@@ -224,10 +222,11 @@ def windows_of(clips: tuple[Clip, ...], window: int, count: int) -> list[tuple[C
 
 def _content(model: str) -> str:
     """Return a hash of a folder's configuration and of its weights' sizes and times."""
-    if not model or not Path(model).is_dir():
+    folder = Path(checkpoint_named(model))
+    if not model or not folder.is_dir():
         return model
     digest = hashlib.sha256()
-    for path in sorted(Path(model).glob("*")):
+    for path in sorted(folder.glob("*")):
         if path.suffix == ".json":
             digest.update(path.read_bytes())
         elif path.suffix == ".safetensors":
