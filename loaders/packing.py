@@ -4,7 +4,7 @@ A clip (`clips`) is one ``mp4`` member of a sample. Its frame k shows frame k of
 labels' geometry: a lens is undone before.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
@@ -240,21 +240,30 @@ def pack_corpus(
     """
     from mint_hub.loaders.shards import write_corpus
 
-    there: list[int] = []
-    missing: dict[str, VideoNotFoundError] = {}
-    for i in range(len(episodes)):
-        episode = episodes[i]
-        try:
-            resolve(VideoReference.of(episode), packer.videos)
-            there.append(i)
-        except VideoNotFoundError as error:
-            missing[episode.key] = error
-    if missing and (on_missing == "raise" or not there):
-        first = next(iter(missing.values()))
-        raise VideoNotFoundError(f"{len(missing)} of {len(episodes)} videos are missing; {first}")
+    missing = missing_videos(episodes, packer.videos)
+    if missing and (on_missing == "raise" or len(missing) == len(episodes)):
+        raise all_missing(missing, len(episodes))
+    there = [i for i in range(len(episodes)) if i not in missing]
     chosen = _Chosen(episodes, there) if missing else episodes
     report = write_corpus(chosen, folder, config, split, extra_members=packer, **options)
-    return PackReport(report, tuple(missing))
+    return PackReport(report, tuple(episodes[i].key for i in missing))
+
+
+def missing_videos(episodes: "Indexed", videos: Videos) -> dict[int, VideoNotFoundError]:
+    """Look for the video of every episode: what is said of those that are not there, by number."""
+    missing: dict[int, VideoNotFoundError] = {}
+    for i in range(len(episodes)):
+        try:
+            resolve(VideoReference.of(episodes[i]), videos)
+        except VideoNotFoundError as error:
+            missing[i] = error
+    return missing
+
+
+def all_missing(missing: Mapping[int, VideoNotFoundError], count: int) -> VideoNotFoundError:
+    """One error for many: how many of ``count``, and the first."""
+    first = next(iter(missing.values()))
+    return VideoNotFoundError(f"{len(missing)} of {count} videos are missing; {first}")
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ def _add_predict(commands: Any) -> None:
     add("--device", help="one device, or several with commas: cuda:0,cuda:1 (default: best here)")
     add("--dtype", default="auto", help="auto, float32, bfloat16 or float16")
     add("--fps", default="30", help='rate to resample to, or "native" (default: 30)')
-    add("--overlap", type=int, help="frames that windows share (default: 8)")
+    add("--overlap", type=int, help="frames that windows share (default: a quarter, at most 8)")
     add("--window", type=int, help="frames in a window (default: the model's)")
     add("--batch-size", type=int, default=1, help="windows at once (default: 1)")
     add("--smooth", action="store_true", help="smooth the hands (Kalman filter and smoother)")

@@ -26,8 +26,8 @@ def add_evaluate(commands: Any) -> None:
     add(
         "model",
         help="mint-tiny, folder or hub repository of a checkpoint; or a folder with labels: saved "
-        f'episodes (KEY.npz, KEY/episode.npz), a corpus; or the word "{TRIVIAL}": the answers without a '
-        "model alone",
+        f'episodes (KEY.npz, KEY/episode.npz), a corpus; or the word "{TRIVIAL}": the answers '
+        "without a model alone",
     )
     _add_benchmark(parser)
     add("-o", "--out", type=Path, help="folder for the results (default: evaluation)")
@@ -77,7 +77,8 @@ def _add_benchmark(parser: argparse.ArgumentParser, required: bool = True) -> No
 def _add_run(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--smooth", action="store_true", help="smooth a checkpoint's hands")
-    add("--overlap", type=int, help="frames that windows share (default: 8)")
+    add("--known-camera", action="store_true", help="tell a checkpoint the true intrinsics")
+    add("--overlap", type=int, help="frames that windows share (default: a quarter, at most 8)")
     add("--window", type=int, help="frames in a window (default: the model's)")
     add("--batch-size", type=int, default=1, help="windows at once (default: 1)")
     add("--device", help="device of a checkpoint (default: best here)")
@@ -199,8 +200,12 @@ def _predictor(args: argparse.Namespace, what: str, name: str | None) -> "Predic
 
     predictor = Predictor.of(what, name, mano_dir=args.mano)
     if predictor.kind == "labels":
-        if args.smooth:
-            raise ValueError("--smooth: expected with a checkpoint, got labels, which stay as is")
+        for option in ("smooth", "known_camera"):
+            if getattr(args, option):
+                raise ValueError(
+                    f"--{option.replace('_', '-')}: expected with a checkpoint, got labels, which "
+                    "stay as is"
+                )
         return predictor
     from dataclasses import replace
 
@@ -216,6 +221,7 @@ def _predictor(args: argparse.Namespace, what: str, name: str | None) -> "Predic
     return replace(
         predictor,
         settings=settings,
+        known_camera=args.known_camera,
         device=args.device,
         dtype=args.dtype,
         revision=args.revision,

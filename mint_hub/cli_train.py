@@ -19,9 +19,10 @@ def add_train(commands: Any) -> None:
         "train",
         help="train a network on corpora with pictures",
         description="Train on packed corpora, or on labels beside your videos. RECIPE is stage1, "
-        "stage2, paper-stage1 or paper-stage2, then options such as +random, +one-source, +world, "
-        "+no-world, +motion, +guide, +visible, +augment, +views, +even, +scratch. Interrupted, the "
-        "same command goes on from the newest checkpoint. Several GPUs: start it with torchrun or "
+        "stage2, paper-stage1 or paper-stage2, then options: +world, "
+        "+no-world, +motion, +guide, +no-image, +random, +pretrained, +one-source, +visible, "
+        "+augment, +views, +refine, +even, +scratch, +fp32. Interrupted, the same command goes on "
+        "from the newest checkpoint. Several GPUs: start it with torchrun or "
         "accelerate. Clips that benchmarks score on are refused. Needs mint-hub[train].",
     )
     add = parser.add_argument
@@ -129,8 +130,9 @@ def _recipe(args: argparse.Namespace) -> "Recipe":
     settings = replace(recipe.optimisation, warmup_steps=warmup)
     if args.seed is not None:
         settings = replace(settings, seed=args.seed)
-    window = args.window or recipe.window
-    stride = args.stride or args.window or recipe.stride
+    window = recipe.window if args.window is None else args.window
+    stride = recipe.stride if args.window is None else args.window
+    stride = stride if args.stride is None else args.stride
     recipe = replace(recipe, optimisation=settings, window=window, stride=stride)
     if args.batch is not None:
         recipe = replace(recipe, batch=args.batch)

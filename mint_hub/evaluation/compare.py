@@ -47,6 +47,8 @@ from mint_hub.view.canvas import plural
 LEVEL: Final = 0.05
 FEWEST_RECORDINGS: Final = 6
 """With fewer pairs no signed-rank test can reach p < 0.05."""
+ROUNDING: Final = 1e-6
+"""Recordings whose numbers differ by no more, relatively, tie."""
 
 
 @dataclass(frozen=True)
@@ -291,6 +293,7 @@ def _difference(
     measure = measure_of(label)
     known = np.isfinite(own[0]) & np.isfinite(own[1])
     steps = _nearer(own[0], own[1], measure.ideal)[known]
+    steps[np.abs(steps) <= ROUNDING * np.maximum(np.abs(own[0]), np.abs(own[1]))[known]] = 0.0
     p, ahead = nan, ""
     if len(steps) >= FEWEST_RECORDINGS and steps.any():
         p = float(wilcoxon(steps).pvalue)  # pyright: ignore[reportAttributeAccessIssue]

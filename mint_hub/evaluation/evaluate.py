@@ -97,7 +97,7 @@ def evaluate(
         source: the benchmark.
         predictor: what to score; None for the trivial rows alone.
         mean: of the training set; what comes with mint-hub without it.
-        jobs: processes; results are the same for any number.
+        jobs: processes; results are the same for any number, a checkpoint's but for rounding.
         on_missing: of a clip without prediction: "raise", or "skip" it and tell.
         progress: show a bar of clips.
 

@@ -1,7 +1,7 @@
 """Where predictions come from: a checkpoint that is run, or labels that lie in a folder.
 
-Predictions of a checkpoint are kept under a name made of the weights, the clip and the options, so
-that a second evaluation runs nothing that the first one did.
+Predictions of a checkpoint are kept under a name made of the weights, the clip, the options and the
+code, so that a second evaluation runs nothing that the first one did, and nothing else serves it.
 """
 
 import hashlib
@@ -11,15 +11,17 @@ import sys
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mint_hub.conventions import MODEL_FPS
 from mint_hub.evaluation.bench_shards import is_corpus, label_files
 from mint_hub.evaluation.clips import BenchmarkError, Clip, MissingFilesError
+from mint_hub.geometry.camera import fov_vh_to_K
 from mint_hub.geometry.hand_model import HandModel
 from mint_hub.loaders.atomic import replacing
 from mint_hub.loaders.reader import CorpusReader
@@ -27,6 +29,8 @@ from mint_hub.loaders.schema import Episode
 
 NOT_THE_MODEL: Final = ("_name_or_path", "transformers_version")
 """Entries of a configuration that say where it came from and who wrote it."""
+
+ONE_LENS_RAD: Final = 1e-3
 
 if TYPE_CHECKING:
     from mint_hub.inference.runner import MintRunner, RunSettings
@@ -54,6 +58,7 @@ class Predictor:
         name: what tables call it.
         kind: "labels" or "checkpoint".
         settings: of a checkpoint's run; None for the usual ones.
+        known_camera: a checkpoint is told each clip's true intrinsics.
         device: a checkpoint's; None for the best here.
         dtype: a checkpoint's.
         revision: of a hub repository.
@@ -66,6 +71,7 @@ class Predictor:
     name: str
     kind: str
     settings: "RunSettings | None" = None
+    known_camera: bool = False
     device: str | None = None
     dtype: str = "auto"
     revision: str | None = None
@@ -219,6 +225,7 @@ class OpenCheckpoint(OpenPredictor):
             "device": str(model.device),
             "dtype": str(model.dtype).removeprefix("torch."),
             "settings": asdict(settings),
+            "known_camera": self._spec.known_camera,
         }
 
     def predict(self, clip: Clip) -> Prediction:
@@ -240,7 +247,8 @@ class OpenCheckpoint(OpenPredictor):
                 f"{len(images)}"
             )
         begun = time.perf_counter()
-        made = self._runner.run(images, self._settings(clip.truth.fps), key=clip.key)
+        settings = self._settings(clip.truth.fps)
+        made = self._runner.run(images, settings, camera=self._camera(clip, images), key=clip.key)
         seconds = time.perf_counter() - begun
         if path is not None:
             with replacing(path) as temporary:
@@ -253,6 +261,19 @@ class OpenCheckpoint(OpenPredictor):
 
         return replace(self._spec.settings or RunSettings(), fps=fps)
 
+    def _camera(self, clip: Clip, images: NDArray[np.uint8]) -> NDArray[np.float64] | None:
+        """Return K (3, 3) of a clip's pictures, where they are to be told."""
+        if not self._spec.known_camera:
+            return None
+        fov = clip.truth.fov_vh_rad.astype(np.float64)
+        if np.ptp(fov, axis=0).max() > ONE_LENS_RAD:
+            low, high = np.rad2deg([fov[:, 1].min(), fov[:, 1].max()])
+            raise BenchmarkError(
+                f"{clip.key}: expected one horizontal field of view, to be told to the checkpoint, "
+                f"got {low:.1f} to {high:.1f} degrees"
+            )
+        return fov_vh_to_K(fov.mean(0), images.shape[1:3])
+
     def _cached(self, clip: Clip) -> Path | None:
         if self._spec.cache_dir is None:
             return None
@@ -262,9 +283,25 @@ class OpenCheckpoint(OpenPredictor):
             "dtype": str(model.dtype),
             "device": model.device.type,
         }
-        words = json.dumps([self.weights_hash, clip.stamp(), options], sort_keys=True, default=str)
+        if self._spec.known_camera:
+            options |= {"known_camera": True}
+        facts = [self.weights_hash, clip.stamp(), options, _code_hash()]
+        words = json.dumps(facts, sort_keys=True, default=str)
         name = hashlib.sha256(words.encode()).hexdigest()[:32]
         return Path(self._spec.cache_dir) / "predictions" / name[:2] / f"{name}.npz"
+
+
+@cache
+def _code_hash() -> str:
+    """16 hex digits that change with the code that a prediction goes through, and with torch's."""
+    import torch
+
+    digest = hashlib.sha256(torch.__version__.encode())
+    package = Path(__file__).parents[1]
+    for room in ("geometry", "inference", "loaders", "model"):
+        for path in sorted((package / room).rglob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def _peak_bytes(device: str) -> int:

@@ -1,8 +1,9 @@
 """What is known of the camera beforehand: its lens, and where it was. Each use is explicit.
 
-A known lens does two things: frames are resampled to a pinhole before the network sees them, and
-the network's hands, which it placed under its own estimate of the focal length, are moved to where
-the true focal length puts them. Known poses replace the predicted camera.
+A known lens does up to three things: frames are resampled to a pinhole before the network sees
+them; the network's hands, which it placed under its own estimate of the focal length, are moved to
+where the true focal length puts them; and where pictures refine the camera's path they do it under
+the true one. Known poses replace the predicted camera.
 """
 
 from collections.abc import Mapping

@@ -73,14 +73,22 @@ class _Device:
 
     @torch.inference_mode()
     def predict(
-        self, windows: Sequence[Window], tokens: Sequence[Sequence["_Token"]], grid: tuple[int, int]
+        self,
+        windows: Sequence[Window],
+        tokens: Sequence[Sequence["_Token"]],
+        grid: tuple[int, int],
+        known_fov_vh: NDArray[np.float64] | None,
     ) -> list[WindowPrediction]:
         """Run a batch of windows of one length, each a list of tokens by frame."""
         device = self.model.device
         stacked = torch.stack(
             [torch.stack([token.result().to(device) for token in row]) for row in tokens]
         )  # (B, T, N, C)
-        output = self.model(patch_tokens=stacked, grid_hw=grid)
+        known = None
+        if known_fov_vh is not None:
+            known = torch.tensor(known_fov_vh, dtype=torch.float32, device=device)
+            known = known.expand(len(windows), 2)
+        output = self.model(patch_tokens=stacked, grid_hw=grid, known_fov_vh=known)
         fields = (output.pose_encoding, output.hand_state, output.presence_logits)
         pose, hands, logits = (field.float().cpu().numpy() for field in fields)
         return [
@@ -108,6 +116,7 @@ class WindowNetwork:
         length: frames in a window.
         overlap: frames that consecutive windows share.
         batch_size: windows that go through the aggregator at once.
+        known_fov_vh: (2,) radians of a lens that is known; the cameras are refined under it.
 
     Raises:
         ValueError: no model, or sizes out of range.
@@ -115,7 +124,12 @@ class WindowNetwork:
     """
 
     def __init__(
-        self, models: Sequence[MintModel], length: int, overlap: int, batch_size: int
+        self,
+        models: Sequence[MintModel],
+        length: int,
+        overlap: int,
+        batch_size: int,
+        known_fov_vh: NDArray[np.float64] | None = None,
     ) -> None:
         if not models:
             raise ValueError("models: expected at least one, got none")
@@ -125,6 +139,7 @@ class WindowNetwork:
         self.length = length
         self.overlap = overlap
         self.batch_size = batch_size
+        self.known_fov_vh = known_fov_vh
         WindowPlanner(self.length, overlap)  # complains about sizes at once
 
     def predict(self, frames: Iterable[torch.Tensor]) -> Iterator[WindowPrediction]:
@@ -153,7 +168,9 @@ class WindowNetwork:
             def launch(batch: list[Window]) -> None:
                 device = next(turn)
                 rows = [[tokens[i] for i in range(w.start, w.stop)] for w in batch]
-                running.append(device.thread.submit(device.predict, batch, rows, grid))
+                running.append(
+                    device.thread.submit(device.predict, batch, rows, grid, self.known_fov_vh)
+                )
 
             for pixels in _batches(frames, ENCODE_BATCH):
                 grid = (pixels.shape[-2] // patch, pixels.shape[-1] // patch)

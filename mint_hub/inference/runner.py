@@ -179,7 +179,8 @@ class MintRunner:
             video: a path, URL, bytes or binary file; or frames in memory (T, H, W, 3).
             settings: see `RunSettings`.
             camera: known intrinsics: K (3, 3), a mapping or a lens (see `lens_from`). Frames are
-                rectified and hands placed under the true focal length.
+                rectified, hands placed under the true focal length, and where pictures refine
+                the camera's path they do it under that.
             camera_poses: known T_camera_from_world, which replace the predicted ones (see
                 `poses_at`).
             key: the episode's key; from the file's name by default.
@@ -199,11 +200,12 @@ class MintRunner:
         if camera_poses is not None:
             check_poses(camera_poses)
         window, overlap = settings.cut(self.models[0].config.window)
-        network = WindowNetwork(self.models, window, overlap, settings.batch_size)
         with VideoInput.open(video, settings.fps, settings.on_error) as source:
             known = None
             if camera is not None:
                 known = KnownCamera.from_user(camera, source.image_size_hw)
+            lens = None if known is None else known.fov_vh_rad
+            network = WindowNetwork(self.models, window, overlap, settings.batch_size, lens)
             times = _Times()
             builder = TrackBuilder(settings.chain_over)
             with frame_bar(source.num_frames, key_from_name(source.name), progress) as bar:
@@ -244,15 +246,17 @@ class MintRunner:
         T_first_from_world = track.T_camera_from_world[0]
         T_camera_from_world = track.T_camera_from_world @ rigid.inverse(T_first_from_world)
         state, fov = track.hand_state, track.fov_vh_rad
+        if settings.fixed_lens:
+            median = np.broadcast_to(np.median(fov, axis=0), fov.shape)
+            state, fov = hands.keep_in_picture(state, fov, median), median
         if known is not None:
             state = correct_translation(state, fov, known.fov_vh_rad)
             fov = np.broadcast_to(known.fov_vh_rad, fov.shape)
             corrections.append("hands placed under the given focal length")
+            if self.models[0].config.camera_refinement == "pictures":
+                corrections.append("camera path refined under the given focal length")
             if known.rectification is not None:
                 corrections.insert(0, "frames rectified by the given lens")
-        elif settings.fixed_lens:
-            median = np.broadcast_to(np.median(fov, axis=0), fov.shape)
-            state, fov = hands.keep_in_picture(state, fov, median), median
         if camera_poses is not None:
             T_camera_from_world = poses_at(camera_poses, timestamps)
             corrections.append("predicted camera replaced by the given poses")

@@ -24,6 +24,8 @@ BELIEF = (math.radians(0.6), 0.004, 2.5, 0.75, 0.08)
 length (metres) may be off by so much; patches are so near (1 / metres), on average, and that may be
 off by so much; so may the logarithm of the focal length."""
 MAX_LOG_BELIEF = 2.0
+KNOWN_LENS_SPREAD = 1e-4
+"""Of the logarithm of a focal length that is known."""
 INITIAL_TRUST = -2.0
 """Logit."""
 INITIAL_FOV_VH_DEG = (60.0, 75.0)
@@ -130,7 +132,12 @@ class MintPathRefinement(nn.Module):
         self.belief = nn.Linear(width, len(BELIEF))
 
     def forward(
-        self, pose: Tensor, fov_vh: Tensor, tokens: Tensor, pictures: Tensor
+        self,
+        pose: Tensor,
+        fov_vh: Tensor,
+        tokens: Tensor,
+        pictures: Tensor,
+        known_fov_vh: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Refine windows.
 
@@ -139,9 +146,10 @@ class MintPathRefinement(nn.Module):
             fov_vh: (B, T, 2) radians; one lens a window, their mean.
             tokens: (B, T, 1 + N, W), the camera's and the patches'.
             pictures: (B, T, 1, H, W), as of `describe`.
+            known_fov_vh: (B, 2) radians, of a lens that is known; poses are refined under it.
 
         Returns:
-            Poses (B, T, 7), and the field of view (B, 2).
+            Poses (B, T, 7), and the field of view (B, 2) that pictures tell, also of a known lens.
         """
         with torch.autocast(tokens.device.type, enabled=False):
             tokens = tokens.to(self.belief.weight.dtype)
@@ -154,6 +162,10 @@ class MintPathRefinement(nn.Module):
             R = quat_xyzw_to_matrix(quat, check=False)
             belief = Belief(R, t, *spreads, trust, fov_vh.float().mean(1))
             R, t, fov = refine_path(pictures, belief, self.patch)
+            if known_fov_vh is not None:
+                fixed = torch.full_like(belief.lens_spread, KNOWN_LENS_SPREAD)
+                belief = belief._replace(fov_vh=known_fov_vh.float(), lens_spread=fixed)
+                R, t, _ = refine_path(pictures, belief, self.patch)
             return torch.cat([t, matrix_to_quat_xyzw(R)], -1), fov
 
 

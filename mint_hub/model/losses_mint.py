@@ -508,12 +508,12 @@ def total(case: LossCase) -> tuple[Tensor, dict[str, Tensor]]:
     return loss, terms
 
 
-def camera_loss(case: LossCase, pose_encoding: Tensor) -> Tensor:
-    """The weighted sum of the camera's terms, for another path (B, T, 9) of the same windows."""
+def camera_loss(case: LossCase, pose_encoding: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    """As `total`, of the camera's terms, for another path (B, T, 9) of the same windows."""
     weights = {n: weight for n, weight in case.settings.weights.items() if n.startswith("camera/")}
     prediction = {**case.prediction, "pose_encoding": pose_encoding}
     settings = replace(case.settings, weights=weights)
-    return total(replace(case, prediction=prediction, settings=settings))[0]
+    return total(replace(case, prediction=prediction, settings=settings))
 
 
 def default_hand(shape_space: str) -> HandModel:

@@ -75,7 +75,8 @@ class MintOutput(ModelOutput):
 
     Attributes:
         loss: scalar, when labels are given.
-        losses: every term of the loss by name, unweighted, when labels are given.
+        losses: every term of the loss by name, unweighted, when labels are given; those of a
+            camera path before pictures refined it, "unrefined/" before them.
         last_hidden_state: (B, T, P, 2C) tokens of the last frame and global layers, joined.
         pose_encoding: (B, T, 9) camera state: translation 3, quaternion xyzw 4 (not normalised),
             field of view (vertical, horizontal); world-to-camera, OpenCV axes.
@@ -426,6 +427,11 @@ class MintModel(MintPreTrainedModel):
         self._init_refinement(refinement)
         self.camera_head.refinement = refinement
 
+    def leave_path_unrefined(self) -> None:
+        """From here on, say the camera head's own path; what was learned of refining it is lost."""
+        self.config.camera_refinement = "none"
+        self.camera_head.refinement = None
+
     def get_input_embeddings(self) -> nn.Module:
         """The convolution that embeds patches."""
         return self.encoder.patch_embedding
@@ -465,6 +471,7 @@ class MintModel(MintPreTrainedModel):
         patch_tokens: Tensor | None = None,
         grid_hw: tuple[int, int] | None = None,
         labels: Mapping[str, Tensor] | None = None,
+        known_fov_vh: Tensor | None = None,
         **kwargs: Unpack[TransformersKwargs],
     ) -> MintOutput:
         """Run windows of frames, given as pixels or as patch tokens from `encode_frames`.
@@ -476,6 +483,9 @@ class MintModel(MintPreTrainedModel):
             labels: the truth, by name (`LossCase`): ``pose_encoding`` (B, T, 9) relative to the
                 first frame, ``hand_state`` (B, T, 2, 109), ``presence`` (B, T, 2), and optional
                 ones.
+            known_fov_vh: (B, 2) radians, vertical and horizontal, where the lens is known: the
+                camera's path is refined under it (`camera_refinement`; without, nothing changes).
+                What comes out as field of view stays the network's own: hands lie under that.
 
         Returns:
             MintOutput: see its attributes. The world is the camera of the window's first frame, as
@@ -507,6 +517,8 @@ class MintModel(MintPreTrainedModel):
                     f"patch_tokens: expected (B, T, {expected[0]}, {expected[1]}) for a grid of "
                     f"{grid_hw}, got {tuple(patch_tokens.shape)}"
                 )
+        if known_fov_vh is not None:
+            self._check_known_fov(known_fov_vh, len(patch_tokens))
         tokens = self.aggregator(patch_tokens, grid_hw, implementation)
         camera_tokens = tokens[:, :, 0]
         poses = self.camera_head(camera_tokens, implementation)
@@ -515,7 +527,9 @@ class MintModel(MintPreTrainedModel):
         if self.camera_head.refinement is not None:
             pictures = self.aggregator.pictures(patch_tokens, grid_hw)
             seen = torch.cat([tokens[:, :, :1], tokens[:, :, self.config.num_special_tokens :]], 2)
-            refined, lens = self.camera_head.refinement(poses[-1], fov, seen, pictures)
+            refined, lens = self.camera_head.refinement(
+                poses[-1], fov, seen, pictures, known_fov_vh
+            )
             poses, fov_before, fov = (*poses, refined), fov, lens[:, None].expand_as(fov)
         wanted = labels is not None and self.loss_settings.weights.get(ATTENTION_TERM, 0) > 0
         looks: list[Tensor] | None = [] if wanted else None
@@ -538,7 +552,9 @@ class MintModel(MintPreTrainedModel):
             output.loss, output.losses = total(case)
             if self.camera_head.refinement is not None:  # what is refined learns by its own errors
                 believed = torch.cat([poses[-2], output.pose_encoding[..., 7:]], -1)
-                output.loss = output.loss + camera_loss(case, believed)
+                own, terms = camera_loss(case, believed)
+                output.loss = output.loss + own
+                output.losses |= {f"unrefined/{name}": term for name, term in terms.items()}
         return output
 
     def _loss_case(
@@ -568,6 +584,18 @@ class MintModel(MintPreTrainedModel):
             shape_space=self.config.shape_space,
             hand_model=self.loss_hand_model,
         )
+
+    @staticmethod
+    def _check_known_fov(known_fov_vh: Tensor, windows: int) -> None:
+        if tuple(known_fov_vh.shape) != (windows, 2):
+            raise ValueError(
+                f"known_fov_vh: expected ({windows}, 2), vertical and horizontal of each window, "
+                f"got {tuple(known_fov_vh.shape)}"
+            )
+        if not ((known_fov_vh > 0) & (known_fov_vh < math.pi)).all():
+            raise ValueError(
+                f"known_fov_vh: expected radians between 0 and pi, got {known_fov_vh.tolist()}"
+            )
 
     def _check_pixels(self, pixel_values: Tensor) -> None:
         patch = self.config.patch_size

@@ -26,7 +26,7 @@ from mint_hub.geometry import camera_state
 from mint_hub.loaders.attach import VideoAttachment
 from mint_hub.loaders.derived import VIDEO_MEMBER
 from mint_hub.loaders.order import Order
-from mint_hub.loaders.packing import packed_images
+from mint_hub.loaders.packing import all_missing, missing_videos, packed_images
 from mint_hub.loaders.resolvers import Videos
 from mint_hub.loaders.schema import Episode
 from mint_hub.synth.undo_lens import undo_lens
@@ -345,6 +345,7 @@ def open_windows(
     Raises:
         DataError: evaluation clips; no windows; a split without pictures. Names what to do.
         CorpusError, EpisodeError: an episode that cannot be read, or that holds NaN.
+        VideoNotFoundError: videos beside the labels that are not there; how many, and the first.
 
     """
     surveys = [s.survey(settings.length, settings.stride, cache_dir) for s in splits]
@@ -356,6 +357,8 @@ def open_windows(
                 f"{split.folder}: expected pictures ({VIDEO_MEMBER} members), found labels alone; "
                 "pack them with `mint-hub pack`, or say where the videos are (--videos)"
             )
+        if not split.packed and (missing := missing_videos(split.reader, settings.videos)):
+            raise all_missing(missing, len(split.reader))
     rows = [(at, i, row) for at, survey in enumerate(surveys) for i, row in enumerate(survey.rows)]
     places, sources, short = _places(rows, settings)
     if not len(places):

@@ -7,8 +7,11 @@ read from it equals what decoding gives, bit for bit. Lenses of synthetic clips 
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
+import os
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -88,6 +91,7 @@ class PixelCache:
         shape = (int(np.sum(reader.num_frames)), *self.size_hw, 3)
         with replacing(self.path) as temporary:
             file = np.lib.format.open_memmap(temporary, "w+", np.uint8, shape)
+            _reserve(temporary)
             at = 0
             for i in range(len(reader)):
                 images = undo_lens(packed_images(reader, i), reader[i])
@@ -115,3 +119,23 @@ class PixelCache:
     def __getstate__(self) -> dict[str, Any]:
         names = ("folder", "split", "size_hw", "filter")
         return {name: getattr(self, name) for name in names}  # an open file stays behind
+
+
+def _reserve(path: Path) -> None:
+    """Take a sparse file's room now: writing a page without room would end the process, silently.
+
+    Raises:
+        OSError: there is not so much room.
+
+    """
+    size = path.stat().st_size
+    if not hasattr(os, "posix_fallocate"):
+        free = shutil.disk_usage(path.parent).free
+        if free < size:
+            raise OSError(errno.ENOSPC, f"{os.strerror(errno.ENOSPC)} for {size} bytes", str(path))
+        return
+    with path.open("r+b") as file:
+        try:
+            os.posix_fallocate(file.fileno(), 0, size)
+        except OSError as error:
+            raise OSError(error.errno, f"{error.strerror} for {size} bytes", str(path)) from None

@@ -33,7 +33,6 @@ __all__ = [
     "Recipe",
     "paper_stage1",
     "paper_stage2",
-    "recipe",
     "recipe_named",
     "release_stage1",
     "release_stage2",
@@ -264,32 +263,3 @@ def recipe_named(name: str) -> Recipe:
             "after stage2 alone"
         )
     return replace(made, name=name)
-
-
-def recipe(
-    family: Literal["release", "paper"] = "release",
-    stage: Literal[1, 2] = 1,
-    *,
-    world: bool | None = None,
-    init: Init | None = None,
-    sources: Sources = "all",
-) -> Recipe:
-    """Make a recipe by its choices, under the name that says them.
-
-    >>> recipe("paper", world=False, init="random").name
-    'paper-stage1+no-world+random'
-
-    Raises:
-        ValueError: as `recipe_named`.
-
-    """
-    if family not in ("release", "paper") or stage not in (1, 2):
-        raise ValueError(
-            f"recipe: expected release or paper, stage 1 or 2, got {family!r}, {stage!r}"
-        )
-    parts = [f"{'paper-' if family == 'paper' else ''}stage{stage}"]
-    if world is not None and stage == 1 and world != (family == "paper"):
-        parts.append("world" if world else "no-world")
-    parts += [init] if init else []
-    parts += ["one-source"] if sources == "one" else []
-    return recipe_named("+".join(parts))

@@ -8,13 +8,14 @@ checkpoint; another one is refused. At the end the network lies in ``model``.
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import torch
 from transformers.trainer_utils import set_seed
@@ -151,22 +152,20 @@ def train(request: Request) -> Report:
         **({"fsdp": True, "fsdp_config": {"version": 2}} if request.fsdp else {}),
     )
     config = _config(request, checkpoint)
-    config.window, refined_before = request.recipe.window, config.camera_refinement
-    if request.recipe.refine:
-        config.camera_refinement = "pictures"
-        config.validate_architecture()
     windows = _windows(request, config, out)
     _check_windows(request, config, windows)
     facts = _facts(request, config, windows)
-    with arguments.main_process_first(desc="run.json"):
-        _same_run(out, facts, request.command)
-        if arguments.process_index == 0:
-            shutil.rmtree(out / STAGING, ignore_errors=True)
+    _check_run(out, facts)
+    validation = _validation(request, windows, out)
     done = out / MODEL
     if done.is_dir() and checkpoint is not None and _step(checkpoint) >= request.pace.steps:
         return Report(done, _step(checkpoint), _step(checkpoint), read_log(out), windows.warnings)
     set_seed(request.recipe.optimisation.seed)
-    model = MintModel(config) if checkpoint is not None else _model(request, config, refined_before)
+    model = MintModel(config) if checkpoint is not None else _model(request, config)
+    with arguments.main_process_first(desc="run.json"):  # from here on it is a run
+        if arguments.process_index == 0:
+            _record(out, facts, request.command)
+            shutil.rmtree(out / STAGING, ignore_errors=True)
     model.set_attn_implementation(request.attention)
     if request.compile:
         compile_layers(model)
@@ -184,7 +183,7 @@ def train(request: Request) -> Report:
             _augmentation(request),
             ViewAugmentation() if request.recipe.views else None,
         ),
-        _validation(request, windows, out),
+        validation,
         _Card(request, facts),
     )
     trainer.train(resume_from_checkpoint=None if checkpoint is None else str(checkpoint))
@@ -210,6 +209,12 @@ def _check(request: Request) -> None:
             f"recipe {recipe.name}: stage 2 trains the camera head of a stage 1 network: expected "
             f"its folder or repository as --init, got {request.init!r}"
         )
+    if recipe.stage == 2 and request.noise is not None:
+        raise ValueError(
+            f"recipe {recipe.name}: stage 2 learns from exact cameras: expected no teacher noise"
+        )
+    if request.validation and request.pace.evaluate_every is None:
+        raise ValueError("validation: expected with evaluate_every, which says when, got it alone")
     if recipe.init == "random" and not random:
         raise ValueError(f"recipe {recipe.name}: expected --init random, got {request.init!r}")
     if recipe.init == "pretrained" and random:
@@ -222,9 +227,20 @@ def _check(request: Request) -> None:
 
 
 def _config(request: Request, checkpoint: Path | None) -> MintConfig:
-    """Sizes of the network, without its weights."""
-    if checkpoint is not None:
-        return MintConfig.from_pretrained(checkpoint)
+    """Of the network that is trained; of one that lies there, if the request does not say."""
+    lies = checkpoint is not None and request.config is None
+    config = MintConfig.from_pretrained(checkpoint) if lies else copy.deepcopy(_sizes(request))
+    config.window = request.recipe.window
+    if request.recipe.refine:
+        config.camera_refinement = "pictures"
+        config.validate_architecture()
+    elif request.recipe.stage == 1:  # which learns the network's own path
+        config.camera_refinement = "none"
+    return config
+
+
+def _sizes(request: Request) -> MintConfig:
+    """Of the network that it begins with, without its weights."""
     if request.init == "random" or request.init.endswith(".pt"):
         if request.init != "random" and not Path(request.init).is_file():
             raise ValueError(f"--init {request.init}: no such file")
@@ -239,19 +255,20 @@ def _config(request: Request, checkpoint: Path | None) -> MintConfig:
     return MintConfig.from_pretrained(checkpoint_named(request.init))
 
 
-def _model(
-    request: Request, config: MintConfig, refined_before: Literal["none", "pictures"]
-) -> MintModel:
+def _model(request: Request, config: MintConfig) -> MintModel:
     if request.init == "random":
         return MintModel(config)
     if request.init.endswith(".pt"):
         return MintModel.from_lingbot_map(request.init, config)
-    config.camera_refinement = refined_before  # as the weights are
+    given = copy.deepcopy(config)
+    given.camera_refinement = _sizes(request).camera_refinement  # as its weights are
     model = MintModel.from_pretrained(
-        checkpoint_named(request.init), config=config, dtype=torch.float32
+        checkpoint_named(request.init), config=given, dtype=torch.float32
     )
-    if request.recipe.refine:
+    if config.camera_refinement == "pictures":
         model.refine_by_pictures()
+    else:
+        model.leave_path_unrefined()
     return model
 
 
@@ -349,14 +366,19 @@ def _facts(request: Request, config: MintConfig, windows: TrainingWindows) -> di
     return json.loads(json.dumps(facts))
 
 
-def _same_run(out: Path, facts: dict[str, Any], command: str) -> None:
-    """Write the record of a new run, and what began it; refuse another run's folder."""
+def _record(out: Path, facts: dict[str, Any], command: str) -> None:
+    """Write what a new run is, and what began it."""
+    if not (out / RUN).is_file():
+        with replacing(out / RUN) as temporary:
+            temporary.write_text(json.dumps({**facts, "command": command}, indent=1) + "\n")
+
+
+def _check_run(out: Path, facts: dict[str, Any]) -> None:
+    """Refuse another run's folder."""
     path = out / RUN
     if not path.is_file():
         if last_checkpoint(out) is not None:
             raise ValueError(f"{out}: has checkpoints but no {RUN}: choose another folder")
-        with replacing(path) as temporary:
-            temporary.write_text(json.dumps({**facts, "command": command}, indent=1) + "\n")
         return
     try:
         before = json.loads(path.read_text())

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mint_hub.geometry import hand_state as hands
 from mint_hub.geometry.camera import fov_vh_to_K, on_screen, project
-from mint_hub.geometry.hand_model import HandModel
+from mint_hub.geometry.hand_model import HandModel, ShapeSpace
 from mint_hub.geometry.hand_state import HandState, mirror_rotations
 from mint_hub.geometry.rotations import (
     matrix_to_rot6d_rows,
@@ -106,7 +106,8 @@ class View:
             poses, state = turn @ poses, _turned(state, self.turn)
         fov = self.fov_vh_rad(episode.fov_vh_rad)
         if self.zoom < 1 or any(self.turn_rad):
-            presence = presence & _inside(state, fov, episode.image_size_hw)
+            space = episode.meta.get("shape_space")
+            presence = presence & _inside(state, fov, episode.image_size_hw, space)
             state = np.where(presence[..., None], state, hands.absent(presence.shape))
             score = None if score is None else score * presence
             filled = None if filled is None else filled & presence
@@ -221,10 +222,16 @@ def _placed(
 
 
 def _inside(
-    state: NDArray[np.float32], fov_vh_rad: NDArray[np.float64], image_size_hw: tuple[int, int]
+    state: NDArray[np.float32],
+    fov_vh_rad: NDArray[np.float64],
+    image_size_hw: tuple[int, int],
+    shape_space: ShapeSpace | None,
 ) -> NDArray[np.bool_]:
-    """Whether any joint of a hand lies in the picture: (T, 2)."""
-    joints = np.asarray(HandModel.template().keypoints(state.astype(np.float64)))
+    """Whether any joint of a hand lies in the picture, (T, 2); joints of shapes that are not the
+    template's are those of the mean shape.
+    """
+    model = HandModel.template()
+    joints = np.asarray(model.keypoints(state.astype(np.float64), shape_space=shape_space))
     uv, z = project(joints, np.asarray(fov_vh_to_K(fov_vh_rad, image_size_hw)))
     seen: NDArray[np.bool_] = np.asarray(on_screen(uv, z, image_size_hw))
     return np.any(seen, axis=-1)

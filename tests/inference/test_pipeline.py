@@ -157,6 +157,21 @@ def test_known_camera_is_explicit_in_the_result(pipe, clip, episode):
     assert rectified.meta["provenance"]["corrections"][0] == "frames rectified by the given lens"
 
 
+def test_a_known_lens_refines_the_path(clip):
+    """It is told to every window, and the result says so; the network's own lens does not."""
+    sizes = {"image_size": (56, 56), "patch_size": 8, "window": 16}
+    model = small_model(motion_radius=2, camera_refinement="pictures", **sizes)
+    pipe = pipeline("egocentric-hands", model=model)
+    free = pipe(str(clip))
+    own, wide = (pipe(str(clip), camera=K) for K in (free.K[0], free.K[0] * [[0.5], [0.5], [1]]))
+    said = ["hands placed under the given focal length"]
+    said += ["camera path refined under the given focal length"]
+    assert own.meta["provenance"]["corrections"] == said
+    turns = [e.T_camera_from_world[:, :3, :3] for e in (own, wide)]
+    assert np.abs(turns[0] - turns[1]).max() > 1e-4
+    np.testing.assert_array_equal(own.presence, free.presence)
+
+
 def test_known_poses_replace_the_camera(pipe, clip, episode):
     poses = np.tile(np.eye(4), (FRAMES, 1, 1))
     poses[:, 2, 3] = np.linspace(0, 1, FRAMES)

@@ -5,10 +5,16 @@ import torch
 from huggingface_hub.errors import StrictDataclassError
 
 from mint_hub.geometry.hand_state import absent
-from mint_hub.geometry.rotations import geodesic_angle, matrix_to_quat_xyzw, rotvec_to_matrix
+from mint_hub.geometry.rotations import (
+    geodesic_angle,
+    matrix_to_quat_xyzw,
+    quat_xyzw_to_matrix,
+    rotvec_to_matrix,
+)
+from mint_hub.model.alignment_mint import with_slopes
 from mint_hub.model.belief_mint import Belief
-from mint_hub.model.egomotion_mint import refine_path
-from mint_hub.model.heads_mint import BELIEF
+from mint_hub.model.egomotion_mint import STRONGEST, Bundle, refine_path
+from mint_hub.model.heads_mint import BELIEF, MintPathRefinement
 from mint_hub.model.layers_mint import patch_centres
 from mint_hub.model.losses_mint import RELEASE_STAGE_2, LossSettings
 from tests.small_model import assert_loads_as_saved, small_config, small_model
@@ -123,6 +129,35 @@ def test_a_mistaken_lens_is_mended_where_the_camera_turns(longer):
     torch.testing.assert_close(sure[0], wrong, atol=1e-3, rtol=0)
 
 
+def test_a_lens_moves_by_its_share_of_what_pictures_and_belief_say():
+    """Where both weigh, it ends between them, however many steps are walked."""
+    truth = path(8, turn=0.02)
+    wrong = 2 * ((FOV_VH / 2).tan() / 1.12).atan()
+    R, t = (part[None] for part in mistaken(truth))
+    trust, moved = torch.full((1, PATCHES), 0.5), []
+    for spread in (1e-4, 3e-3, 8e-2):
+        spreads = (torch.tensor([value]) for value in (*BELIEF[:-1], spread))
+        _, _, fov = refine_path(drawn(truth), Belief(R, t, *spreads, trust, wrong[None]), PATCH)
+        moved.append(float(((fov[0] / 2).tan() / (wrong / 2).tan()).log()[0]))
+    assert abs(moved[0]) < 1e-3
+    assert 0.01 < moved[1] < 0.05
+    assert moved[2] > 0.1
+
+
+def test_the_steepest_pixels_of_a_patch_are_looked_at():
+    generator = torch.Generator().manual_seed(1)
+    pictures = torch.randn(2, 3, 1, 32, 48, generator=generator)
+    bundle = Bundle(pictures, FOV_VH.expand(2, 2), 8, 0.2)
+    slopes = with_slopes(pictures[:, 1])[:, 1:] * torch.tensor([32.0, 48.0])[:, None, None] / 2
+    steep = slopes.square().sum(1)  # (B, H, W)
+    patches = steep.unflatten(2, (6, 8)).unflatten(1, (4, 8)).permute(0, 1, 3, 2, 4)
+    expected = patches.reshape(2, 24, 64).topk(STRONGEST).values.sort(-1).values
+    columns, rows = ((bundle.places[:, 0, :, i] + 1) * n / 2 for i, n in enumerate((48, 32)))
+    at = rows.floor().long() * 48 + columns.floor().long()
+    found = steep.flatten(1).gather(1, at).unflatten(1, (24, STRONGEST)).sort(-1).values
+    torch.testing.assert_close(found, expected)
+
+
 def test_the_first_pose_stays_and_the_world_with_it():
     """Another world gives the same path in that world."""
     truth = path(6)
@@ -233,6 +268,42 @@ def test_a_network_refines_what_its_camera_head_says():
     assert not torch.allclose(last[:, 1:, :3], believed[:, 1:, :3], atol=1e-5)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_path_is_refined_under_a_lens_that_is_known(seed):
+    """Nearer the truth than under the lens that the network believes in, which is still told."""
+    truth = path(6, turn=0.005)  # too little for pictures to tell the lens by
+    refinement = MintPathRefinement(8, PATCH)
+    for parameter in (*refinement.belief.parameters(), *refinement.trust.fc2.parameters()):
+        torch.nn.init.zeros_(parameter)
+    R, t = mistaken(truth, seed)
+    pose = torch.cat([t, matrix_to_quat_xyzw(R)], -1)[None]
+    wrong = (2 * ((FOV_VH / 2).tan() * 0.7).atan()).expand(1, 6, 2)
+    given = pose, wrong, torch.zeros(1, 6, 1 + PATCHES, 8), drawn(truth, seed)
+    with torch.no_grad():
+        (free, lens), (known, told) = (refinement(*given, fov) for fov in (None, FOV_VH[None]))
+    errors = [off((quat_xyzw_to_matrix(p[0, :, 3:]), p[0, :, :3]), truth) for p in (free, known)]
+    assert torch.equal(lens, told)
+    assert errors[1][0] < 0.7 * errors[0][0]
+    assert errors[1][0] < 0.06
+
+
+def test_a_known_lens_changes_the_camera_path_alone():
+    model = small_model(**REFINED)
+    frames = torch.rand(2, 4, 3, 48, 64, generator=torch.Generator().manual_seed(2))
+    with torch.no_grad():
+        before, after = model(frames), model(frames, known_fov_vh=FOV_VH.expand(2, 2))
+        plain = small_model(**(REFINED | {"camera_refinement": "none"}))
+        same = plain(frames), plain(frames, known_fov_vh=FOV_VH.expand(2, 2))
+    assert not torch.equal(before.pose_encoding[..., :7], after.pose_encoding[..., :7])
+    assert torch.equal(before.pose_encoding[..., 7:], after.pose_encoding[..., 7:])
+    assert torch.equal(before.hand_state, after.hand_state)
+    assert torch.equal(same[0].pose_encoding, same[1].pose_encoding)
+    with pytest.raises(ValueError, match=r"known_fov_vh: expected \(2, 2\).* got \(2,\)"):
+        model(frames, known_fov_vh=FOV_VH)
+    with pytest.raises(ValueError, match=r"known_fov_vh: expected radians.* got \[\[63"):
+        model(frames, known_fov_vh=FOV_VH.rad2deg().expand(2, 2))
+
+
 def labels_of(truth: Poses) -> dict[str, torch.Tensor]:
     """Of one window: its path; hands are absent."""
     frames = len(truth[1])
@@ -247,20 +318,42 @@ def labels_of(truth: Poses) -> dict[str, torch.Tensor]:
 
 
 def test_the_path_that_is_refined_learns_by_its_own_errors():
-    """The loss has both paths' camera terms; hands' terms once."""
+    """The loss has both paths' camera terms, each under its name; hands' terms once."""
     model, truth = small_model(**REFINED), path(4)
     pictures = torch.rand(1, 4, 3, 48, 64, generator=torch.Generator().manual_seed(4))
     with torch.no_grad():
         output = model(pictures, labels=labels_of(truth))
     assert output.loss is not None
     weights = model.loss_settings.weights
-    once = sum(weights[name] * float(value) for name, value in output.losses.items())
+    told = {name: float(value) for name, value in output.losses.items()}
+    every = sum(weights[name.removeprefix("unrefined/")] * value for name, value in told.items())
+    assert float(output.loss) == pytest.approx(every, rel=1e-5)
     model.camera_head.refinement = None
     with torch.no_grad():
-        unrefined = model(pictures, labels=labels_of(truth)).losses
-    own = sum(weights[n] * float(v) for n, v in unrefined.items() if n.startswith("camera/"))
+        alone = model(pictures, labels=labels_of(truth)).losses
+    own = sum(weights[n] * float(v) for n, v in alone.items() if n.startswith("camera/"))
     assert own > 0
-    assert float(output.loss) == pytest.approx(once + own, rel=1e-5)
+    unrefined = sum(
+        weights[name.removeprefix("unrefined/")] * value
+        for name, value in told.items()
+        if name.startswith("unrefined/")
+    )
+    assert unrefined == pytest.approx(own, rel=1e-5)
+
+
+def test_a_path_does_not_learn_through_its_refinement():
+    """Errors that pictures mend would teach it nothing; trust, beliefs and the lens do."""
+    truth = path(4)
+    refinement = MintPathRefinement(8, PATCH)
+    pose = torch.cat([truth[1], matrix_to_quat_xyzw(truth[0])], -1)[None].requires_grad_()
+    fov = FOV_VH.expand(1, 4, 2).clone().requires_grad_()
+    tokens = torch.randn(1, 4, 1 + PATCHES, 8, requires_grad=True)
+    refined, lens = refinement(pose, fov, tokens, drawn(truth))
+    (refined.square().sum() + lens.sum()).backward()
+    assert pose.grad is None
+    for given in (fov, tokens):
+        assert given.grad is not None
+        assert given.grad.any()
 
 
 def test_training_reaches_every_part_of_the_camera_head():

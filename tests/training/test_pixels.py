@@ -1,5 +1,7 @@
 """Kept pictures: what is read is what decoding gives, and the file is whole or not there."""
 
+import errno
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -62,6 +64,21 @@ def test_nothing_is_left_of_a_file_that_could_not_be_made(windows, tmp_path, mon
 
     monkeypatch.setattr("mint_hub.training.pixels.packed_images", broken)
     with pytest.raises(VideoError, match="damaged"):
+        windows.cached(tmp_path / "kept", views=False)
+    assert list((tmp_path / "kept").iterdir()) == []
+
+
+def test_a_disk_without_room_for_the_file_is_told_before_it_is_filled(
+    windows, tmp_path, monkeypatch
+):
+    """It is mapped: to write where there is no room would end the process without a word."""
+
+    def full(descriptor, offset, size):
+        assert os.fstat(descriptor).st_size == offset + size
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(OSError, match=r"No space left on device for \d+ bytes.*pixels-"):
         windows.cached(tmp_path / "kept", views=False)
     assert list((tmp_path / "kept").iterdir()) == []
 

@@ -8,7 +8,6 @@ from mint_hub.training.recipes import (
     PARTS,
     Recipe,
     paper_stage1,
-    recipe,
     recipe_named,
     release_stage1,
     release_stage2,
@@ -49,24 +48,6 @@ def test_motion_weighs_the_camera_and_nothing_else():
     assert {n: w for n, w in after.items() if n not in MOTION} == {
         n: w for n, w in before.items() if n not in MOTION
     }
-
-
-@pytest.mark.parametrize(
-    ("choices", "name"),
-    [
-        ({}, "stage1"),
-        ({"stage": 2}, "stage2"),
-        ({"family": "paper", "world": False}, "paper-stage1+no-world"),
-        ({"world": True, "init": "random"}, "stage1+world+random"),
-        ({"family": "paper", "world": True}, "paper-stage1"),
-        ({"stage": 2, "world": False, "init": "pretrained"}, "stage2+pretrained"),
-        ({"sources": "one"}, "stage1+one-source"),
-    ],
-)
-def test_ablations_have_names(choices, name):
-    made = recipe(**choices)
-    assert made.name == name
-    assert recipe_named(name) == made
 
 
 def test_every_option_changes_a_recipe():

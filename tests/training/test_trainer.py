@@ -10,6 +10,7 @@ import torch
 
 from mint_hub.model.modeling_mint import MintModel
 from mint_hub.model.processing_mint import MintProcessor
+from mint_hub.synth.teacher_noise import TeacherNoise
 from mint_hub.training.clips import DataError
 from mint_hub.training.recipes import PARTS, recipe_named
 from mint_hub.training.run import Request, train
@@ -187,6 +188,12 @@ def test_stage_2_refines_by_pictures_from_here_on(trained, corpus, tmp_path):
     again = train(request(corpus, tmp_path / "two", **second))
     assert again.resumed_from == 2
     assert losses(again) == losses(whole)
+    assert "unrefined/camera/trans_l1" in whole.log[0]
+    third = {"pace": Pace(1, log_every=1), "init": str(whole.model), "config": None}
+    for name, refined in (("stage2", "pictures"), ("stage1", "none")):
+        more = train(request(corpus, tmp_path / name, recipe=small(name, batch=2), **third))
+        assert MintModel.from_pretrained(more.model).config.camera_refinement == refined
+        assert set(weights(more.model)) == set(after if refined == "pictures" else before)
     blind = second | {"init": str(trained.model)}
     with pytest.raises(ValueError, match="motion_radius: expected at least 1"):
         train(request(corpus, tmp_path / "blind", **blind))
@@ -290,6 +297,9 @@ def test_requests_that_contradict_themselves(corpus, tmp_path):
         ({"init": str(tmp_path / "lingbot-map.pt")}, "no such file"),
         ({"recipe": recipe_named("stage1")}, "more than the 2000 steps of warm-up"),
         ({"data": [tmp_path]}, "expected a corpus with a train split"),
+        ({"validation": [corpus]}, "validation: expected with evaluate_every"),
+        ({"recipe": small("stage2"), "init": "x", "noise": TeacherNoise()}, "no teacher noise"),
+        ({"pace": Pace(2, evaluate_every=1), "validation": [tmp_path]}, "with a validation split"),
         ({"config": type(config())(**(config().to_dict() | {"shape_space": "mano"}))}, "'mint'"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -310,7 +320,13 @@ def test_a_checkpoint_of_another_size(trained, corpus, tmp_path):
     other = type(config())(**(config().to_dict() | {"hidden_size": 48}))
     with pytest.raises(ValueError, match="do not fit"):
         train(request(corpus, tmp_path / "run", init=str(trained.model), config=other))
-    assert not list((tmp_path / "run").glob("checkpoint-*"))
+    assert not (tmp_path / "run" / "run.json").exists()  # the mended command may have the folder
+    assert other.window == config().window
+    out = shutil.copytree(trained.model.parent, tmp_path / "trained")
+    for name in ("model", "checkpoint-4"):
+        shutil.rmtree(out / name)
+    with pytest.raises(ValueError, match="another run lies here: config was"):
+        train(request(corpus, out, config=other))
 
 
 @pytest.mark.parametrize("at", [2, 4])

@@ -132,6 +132,21 @@ def test_hands_outside_a_crop_are_not_present():
     )
 
 
+def test_hands_of_another_shape_space_are_looked_for_as_the_mean_hand():
+    rng = np.random.default_rng(0)
+    before = episode()
+    shaped, mean = before.hand_state.copy(), before.hand_state.copy()
+    shaped[..., -10:], mean[..., -10:] = rng.normal(size=10) * 6, 0.0
+    made = [
+        replace(before, hand_state=state, meta={**before.meta, "shape_space": space})
+        for state, space in ((shaped, "mano"), (mean, "mint"), (shaped, "mint"))
+    ]
+    views = [View(zoom=zoom) for zoom in (0.3, 0.35, 0.4, 0.45, 0.5, 0.6, 0.7)]
+    mano, template, read = (np.array([v.episode(e).presence for v in views]) for e in made)
+    np.testing.assert_array_equal(mano, template)
+    assert (read != template).any()  # what taking them for ours would give
+
+
 def test_views_are_drawn_as_said_and_bad_ones_refused():
     rng = np.random.default_rng(0)
     drawn = [ViewAugmentation(mirror=0.3, zoom=0.6)(rng) for _ in range(600)]
