@@ -123,7 +123,7 @@ def evaluate(
         prediction=facts,
         clips=clips,
         trained_on=mean.trained_on,
-        efficiency=efficiency_of(clips, facts) if facts else None,
+        efficiency=efficiency_of(clips, facts, jobs) if facts else None,
         warnings=tuple(_warnings(clips, skipped)),
         skipped=skipped,
         mint_hub=__version__,

@@ -206,11 +206,12 @@ class Results:
 
 
 def efficiency_of(
-    clips: Sequence[ClipResult], prediction: Mapping[str, Any]
+    clips: Sequence[ClipResult], prediction: Mapping[str, Any], processes: int = 1
 ) -> dict[str, Any] | None:
     """Speed and memory of the clips that were predicted in this run, but each process's first.
 
-    From decoded pictures to the fused episode. None where there are no others.
+    From decoded pictures to the fused episode, in each of the processes that run side by side and
+    share the cores. None where there are no others.
     """
     timed = [clip for clip in clips if clip.seconds is not None and not clip.warm_up]
     if not timed:
@@ -222,6 +223,7 @@ def efficiency_of(
         "seconds": seconds,
         "ms_a_frame": 1e3 * seconds / frames,
         "frames_a_second": frames / seconds,
+        "processes": processes,
         "peak_memory_bytes": max(c.peak_bytes or 0 for c in timed),
         "device": prediction.get("device"),
         "dtype": prediction.get("dtype"),

@@ -146,9 +146,11 @@ def write_markdown(results: Results, path: Path) -> Path:
 def efficiency_line(facts: Mapping[str, Any]) -> str:
     """Speed and memory in a sentence."""
     memory = facts["peak_memory_bytes"] / 2**30
+    count = facts.get("processes", 1)
+    shared = "" if count == 1 else f" in each of {count} processes side by side"
     return (
-        f"{facts['ms_a_frame']:.1f} ms a frame ({facts['frames_a_second']:.1f} frames/s) over "
-        f"{facts['frames']} frames after warm-up, from decoded pictures to the fused episode; "
+        f"{facts['ms_a_frame']:.1f} ms a frame ({facts['frames_a_second']:.1f} frames/s){shared}, "
+        f"over {facts['frames']} frames after warm-up, from decoded pictures to the fused episode; "
         f"peak memory {memory:.2f} GiB; {facts['device']}, {facts['dtype']}, window "
         f"{facts['window']}, overlap {facts['overlap']}, batch {facts['batch_size']}."
     )

@@ -11,6 +11,8 @@ from mint_hub.evaluation.benchmarks import open_benchmark
 from mint_hub.evaluation.clips import BenchmarkError, Source
 from mint_hub.evaluation.evaluate import evaluate
 from mint_hub.evaluation.predictor import OpenCheckpoint, Predictor
+from mint_hub.evaluation.results import efficiency_of
+from mint_hub.evaluation.tables import efficiency_line
 from mint_hub.inference.runner import MintRunner
 from tests.small_model import small_model
 from tests.training.corpus import still, training_episode, write_packed
@@ -89,6 +91,14 @@ def test_the_true_lens_is_told_in_pixels_of_the_pictures(source, checkpoint, mon
 
 def test_processes_give_the_same_and_labels_are_told_nothing(source, checkpoint, tmp_path, capsys):
     one, two = (evaluate(source, Predictor.of(checkpoint), jobs=jobs) for jobs in (1, 2))
+    assert one.prediction is not None
+    for count, said in (
+        (1, "frames/s), over 9 frames"),
+        (2, "in each of 2 processes side by side"),
+    ):
+        told = efficiency_of(one.clips, one.prediction, count)
+        assert told is not None
+        assert said in efficiency_line(told)
     for a, b in zip(one.clips, two.clips, strict=True):
         a, b = (numbers_of(asdict(clip.scores["prediction"])) for clip in (a, b))
         assert len(a) > 20
