@@ -352,12 +352,14 @@ def open_windows(
     for split, survey in zip(splits, surveys, strict=True):
         if not settings.allow_evaluation_clips:
             _refuse_evaluation_clips(split, survey)
-        if not split.packed and settings.videos is None:
+        if split.packed:
+            continue
+        if settings.videos is None:
             raise DataError(
                 f"{split.folder}: expected pictures ({VIDEO_MEMBER} members), found labels alone; "
                 "pack them with `mint-hub pack`, or say where the videos are (--videos)"
             )
-        if not split.packed and (missing := missing_videos(split.reader, settings.videos)):
+        if missing := missing_videos(split.reader, settings.videos):
             raise all_missing(missing, len(split.reader))
     rows = [(at, i, row) for at, survey in enumerate(surveys) for i, row in enumerate(survey.rows)]
     places, sources, short = _places(rows, settings)

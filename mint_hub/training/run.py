@@ -228,8 +228,10 @@ def _check(request: Request) -> None:
 
 def _config(request: Request, checkpoint: Path | None) -> MintConfig:
     """Of the network that is trained; of one that lies there, if the request does not say."""
-    lies = checkpoint is not None and request.config is None
-    config = MintConfig.from_pretrained(checkpoint) if lies else copy.deepcopy(_sizes(request))
+    if checkpoint is not None and request.config is None:
+        config = MintConfig.from_pretrained(checkpoint)
+    else:
+        config = copy.deepcopy(_sizes(request))
     config.window = request.recipe.window
     if request.recipe.refine:
         config.camera_refinement = "pictures"
