@@ -128,14 +128,13 @@ def _reserve(path: Path) -> None:
         OSError: there is not so much room.
 
     """
-    size = path.stat().st_size
-    if not hasattr(os, "posix_fallocate"):
-        free = shutil.disk_usage(path.parent).free
+    size, free = path.stat().st_size, shutil.disk_usage(path.parent).free
+    try:
         if free < size:
-            raise OSError(errno.ENOSPC, f"{os.strerror(errno.ENOSPC)} for {size} bytes", str(path))
-        return
-    with path.open("r+b") as file:
-        try:
-            os.posix_fallocate(file.fileno(), 0, size)
-        except OSError as error:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        if hasattr(os, "posix_fallocate"):
+            with path.open("r+b") as file:
+                os.posix_fallocate(file.fileno(), 0, size)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP):  # not every file system can
             raise OSError(error.errno, f"{error.strerror} for {size} bytes", str(path)) from None

@@ -48,6 +48,10 @@ __all__ = ["CARD_HEAD", "MODEL", "RUN", "Report", "Request", "first_line", "read
 RUN: Final = "run.json"
 MODEL: Final = "model"
 SURVEYS: Final = "surveys"
+LEFT_OUT: Final = (
+    "the network began with a camera refinement by pictures, which is left out: stage 1 learns its "
+    "own path; stage2+refine puts a new one there"
+)
 CARD_HEAD: Final = "---\nlibrary_name: transformers\ntags:\n- mint\n- egocentric\n- hands\n---\n"
 
 
@@ -113,7 +117,7 @@ class Report:
         steps: done in all.
         resumed_from: step of the checkpoint that it went on from; 0: from the beginning.
         log: the lines of the log.
-        warnings: what was left out of the data, in words.
+        warnings: what was left out of the data or the network, in words.
 
     """
 
@@ -161,7 +165,13 @@ def train(request: Request) -> Report:
     if done.is_dir() and checkpoint is not None and _step(checkpoint) >= request.pace.steps:
         return Report(done, _step(checkpoint), _step(checkpoint), read_log(out), windows.warnings)
     set_seed(request.recipe.optimisation.seed)
-    model = MintModel(config) if checkpoint is not None else _model(request, config)
+    notes = list(windows.warnings)
+    if checkpoint is not None:
+        model = MintModel(config)
+    else:
+        model = _model(request, config)
+        if config.camera_refinement != _sizes(request).camera_refinement == "pictures":
+            notes.append(LEFT_OUT)
     with arguments.main_process_first(desc="run.json"):  # from here on it is a run
         if arguments.process_index == 0:
             _record(out, facts, request.command)
@@ -195,7 +205,7 @@ def train(request: Request) -> Report:
         trainer.state.global_step,
         0 if checkpoint is None else _step(checkpoint),
         list(trainer.state.log_history),
-        windows.warnings,
+        tuple(notes),
     )
 
 

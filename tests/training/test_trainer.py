@@ -194,6 +194,7 @@ def test_stage_2_refines_by_pictures_from_here_on(trained, corpus, tmp_path):
         more = train(request(corpus, tmp_path / name, recipe=small(name, batch=2), **third))
         assert MintModel.from_pretrained(more.model).config.camera_refinement == refined
         assert set(weights(more.model)) == set(after if refined == "pictures" else before)
+        assert any("left out" in note for note in more.warnings) == (refined == "none")
     blind = second | {"init": str(trained.model)}
     with pytest.raises(ValueError, match="motion_radius: expected at least 1"):
         train(request(corpus, tmp_path / "blind", **blind))
