@@ -212,6 +212,10 @@ def _read_camera(text: str) -> Any:
         raise ValueError(
             f"--camera: expected JSON (or a .json file), got {text!r}: {error}"
         ) from None
+    except OSError as error:
+        raise ValueError(
+            f"--camera: {text}: expected a readable file, got: {error.strerror}"
+        ) from None
 
 
 def _read_poses(text: str) -> Any:
@@ -224,6 +228,10 @@ def _read_poses(text: str) -> Any:
         raise ValueError(
             f"--camera-poses: {text}: expected a .npy with (T, 4, 4), or a .npz with timestamps_s "
             "and T_camera_from_world"
+        ) from None
+    except OSError as error:
+        raise ValueError(
+            f"--camera-poses: {text}: expected a readable file, got: {error.strerror}"
         ) from None
 
 

@@ -156,6 +156,8 @@ def test_unusual_videos_work(predict, tmp_path):
     [
         (["--camera", "[[1, 0], [0, 1]]"], "K"),
         (["--camera", "{not json"], "--camera"),
+        (["--camera", "none.json"], "--camera: none.json: expected a readable file, got: No such"),
+        (["--camera-poses", "none.npy"], "--camera-poses: none.npy: expected a readable file"),
     ],
 )
 def test_cameras_that_do_not_fit(predict, clips, capsys, arguments, message):
