@@ -169,8 +169,9 @@ def train(request: Request) -> Report:
     if checkpoint is not None:
         model = MintModel(config)
     else:
-        model = _model(request, config)
-        if config.camera_refinement != _sizes(request).camera_refinement == "pictures":
+        begun = _sizes(request)
+        model = _model(request, begun, config)
+        if begun.camera_refinement == "pictures" and config.camera_refinement == "none":
             notes.append(LEFT_OUT)
     with arguments.main_process_first(desc="run.json"):  # from here on it is a run
         if arguments.process_index == 0:
@@ -261,19 +262,19 @@ def _sizes(request: Request) -> MintConfig:
         raise ValueError(f"--init {request.init}: no such folder")
     if request.config is not None:
         return request.config
-    folder = Path(checkpoint_named(request.init))
-    if folder.is_dir() and not (folder / "config.json").is_file():
+    name = checkpoint_named(request.init)
+    if Path(name).is_dir() and not Path(name, "config.json").is_file():
         return MintConfig.full()  # of the public release; from_pretrained checks its shapes
-    return MintConfig.from_pretrained(checkpoint_named(request.init))
+    return MintConfig.from_pretrained(name)
 
 
-def _model(request: Request, config: MintConfig) -> MintModel:
+def _model(request: Request, begun: MintConfig, config: MintConfig) -> MintModel:
     if request.init == "random":
         return MintModel(config)
     if request.init.endswith(".pt"):
         return MintModel.from_lingbot_map(request.init, config)
     given = copy.deepcopy(config)
-    given.camera_refinement = _sizes(request).camera_refinement  # as its weights are
+    given.camera_refinement = begun.camera_refinement  # as its weights are
     model = MintModel.from_pretrained(
         checkpoint_named(request.init), config=given, dtype=torch.float32
     )
